@@ -1,0 +1,302 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Every number of the method, one frozen dataclass per step; each step receives only its own.
+
+`Config()` is what measured best; `paper_config()` is the literal paper (its unpublished constants filled in).
+`dump_toml` writes all of it, `load_toml` reads it back and refuses names it does not know.
+"""
+
+import dataclasses
+import sys
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+from vitamin3d.errors import InputError
+
+if sys.version_info >= (3, 11):
+    import tomllib
+else:
+    import tomli as tomllib
+
+
+@dataclass(frozen=True)
+class CurvatureConfig:
+    smoothing_sigma_px: float = 2.0
+
+
+@dataclass(frozen=True)
+class ExtremaConfig:
+    min_curvature: float = 0.3
+    """Noise floor of kappa, grey levels³ per pixel⁴ of the smoothed 0–255 image."""
+    max_tracks: int = 5000
+    refill_interval: int = 3
+    """Frames between two refills with free extrema."""
+    min_distance_px: float = 4.0
+    """New extrema keep this distance from live tracks and from each other."""
+    border_px: int = 8
+
+
+@dataclass(frozen=True)
+class DominantFlowConfig:
+    """Sec. 2.2."""
+
+    reduction: int = 6
+    max_features: int = 500
+    sigma_px: float = 1.0
+    """Scale of Geman–McClure, pixels of the reduced image."""
+    iterations: int = 20
+    min_matches: int = 12
+    min_inlier_ratio: float = 0.25
+
+
+@dataclass(frozen=True)
+class ExtremaTrackingConfig:
+    """Sec. 2.3."""
+
+    prediction: str = "dense_flow"
+    """`dominant_flow` (Eq. 4, the paper) or `dense_flow` (DIS flow, several times more survivors)."""
+    prediction_weight: float = 0.3
+    """lambda of Eq. 5, relative to the noise floor's unit of kappa."""
+    prediction_sigma_px: float = 3.0
+    """sigma of w in Eq. 5."""
+    max_steps: int = 10
+    gate_px: float = 1.5
+    """A climb that ends farther from the prediction is a miss."""
+    coast_frames: int = 1
+    """Frames in a row that a track may live on its prediction."""
+
+
+@dataclass(frozen=True)
+class InitializationConfig:
+    min_motion_px: float = 25.0
+    min_parallax_deg: float = 1.0
+    """Median over the triangulated points."""
+    ransac_threshold_px: float = 1.0
+    min_tracks: int = 100
+    min_inlier_ratio: float = 0.5
+    min_triangulated_ratio: float = 0.5
+    min_surviving_ratio: float = 0.4
+    """Below this share of the reference's tracks, a later frame becomes the reference."""
+    history: int = 90
+    """Frames kept from which references are taken."""
+
+
+@dataclass(frozen=True)
+class LocalizationConfig:
+    ransac_points: int = 400
+    ransac_iterations: int = 100
+    ransac_threshold_px: float = 4.0
+    sigma_px: float = 2.0
+    iterations: int = 12
+    outlier_px: float = 4.0
+    min_inliers: int = 30
+    min_inlier_ratio: float = 0.25
+
+
+@dataclass(frozen=True)
+class KeyframeConfig:
+    motion_px: float = 12.0
+    """Median motion of the landmarks since the last keyframe."""
+    min_tracked_ratio: float = 0.6
+    """A keyframe is also due when fewer of the last keyframe's landmarks are still tracked."""
+    min_gap: int = 1
+
+
+@dataclass(frozen=True)
+class TriangulationConfig:
+    min_parallax_deg: float = 1.0
+    max_reprojection_px: float = 3.0
+    min_observations: int = 2
+
+
+@dataclass(frozen=True)
+class RecoveryConfig:
+    """Landmarks that come back into view are found again."""
+
+    enabled: bool = True
+    interval: int = 2
+    """Frames between two searches."""
+    max_view_angle_deg: float = 32.0
+    max_distance_ratio: float = 1.25
+    gate_px: float = 2.0
+    min_zncc: float = 0.8
+    patch_px: int = 9
+    min_observations: int = 3
+
+
+@dataclass(frozen=True)
+class WindowConfig:
+    keyframes: int = 12
+    anchors: int = 15
+    """Older keyframes, poses fixed, that share most landmarks with the window."""
+    min_shared_landmarks: int = 40
+
+
+@dataclass(frozen=True)
+class BundleAdjustmentConfig:
+    sigma_px: float = 2.0
+    sweeps_per_frame: int = 2
+    """Subspace Gauss–Newton sweeps over the window at every frame (Eq. 11–12)."""
+    keyframe_solver: str = "schur"
+    """Solver of the window at each keyframe: `schur` (Levenberg–Marquardt, reduced camera system) or `subspace`."""
+    keyframe_iterations: int = 6
+    outlier_px: float = 5.0
+
+
+@dataclass(frozen=True)
+class CloudConfig:
+    """Filter of the exported cloud."""
+
+    min_observations: int = 3
+    min_parallax_deg: float = 1.0
+    max_reprojection_rms_px: float = 1.5
+
+
+@dataclass(frozen=True)
+class SnapshotConfig:
+    """Which landmarks become vertices of a keyframe's mesh."""
+
+    min_observations: int = 3
+    observation_sigma_px: float = 0.7
+    max_relative_deviation: float = 0.5
+
+
+@dataclass(frozen=True)
+class DelaunayConfig:
+    min_vertices: int = 30
+    weight_scale: float = 0.02
+    """Data weight of a vertex = weight_scale / relative deviation of its depth, at most max_weight."""
+    max_weight: float = 20.0
+
+
+@dataclass(frozen=True)
+class NltgvConfig:
+    """NLTGV²-L1 on the Delaunay graph (Greene and Roy 2017), diagonal preconditioning (Pock and Chambolle 2011)."""
+
+    enabled: bool = True
+    iterations: int = 400
+    data_weight: float = 1.0
+    """lambda."""
+    slope_weight: float = 1.0
+    """beta."""
+    pixel_unit: float = 8.0
+    """Pixel coordinates are divided by this, inverse depths by their mean."""
+
+
+@dataclass(frozen=True)
+class DepthRenderingConfig:
+    max_inverse_depth_range: float = 0.25
+    """A triangle whose inverse depths differ by more, relative to their mean, spans a depth edge."""
+    max_slant_deg: float = 80.0
+    max_edge_ratio: float = 0.33
+    """Longest edge in picture widths."""
+    canvas_limit: float = 0.5
+
+
+@dataclass(frozen=True)
+class FusionConfig:
+    backend: str = "scalable"
+    """`scalable` (Open3D ScalableTSDFVolume) or `voxel_block_grid`."""
+    voxel_low: float | None = None
+    """Metres where the scale is known, else map units; None: median depth of the scene / 20 (and / 120)."""
+    voxel_high: float | None = None
+    depth_per_voxel_low: float = 20.0
+    depth_per_voxel_high: float = 120.0
+    truncation_voxels: float = 4.0
+    max_depth: float = 3.0
+    """Depth beyond this many median depths of the scene is not fused."""
+
+
+@dataclass(frozen=True)
+class SurfaceConfig:
+    min_component_triangles: int = 200
+    """Smaller connected pieces of the mesh are removed."""
+
+
+@dataclass(frozen=True)
+class Config:
+    """All settings of a run; the page order is the order of the method."""
+
+    mode: str = "default"
+    seed: int = 0
+    curvature: CurvatureConfig = field(default_factory=CurvatureConfig)
+    extrema: ExtremaConfig = field(default_factory=ExtremaConfig)
+    dominant_flow: DominantFlowConfig = field(default_factory=DominantFlowConfig)
+    extrema_tracking: ExtremaTrackingConfig = field(default_factory=ExtremaTrackingConfig)
+    initialization: InitializationConfig = field(default_factory=InitializationConfig)
+    localization: LocalizationConfig = field(default_factory=LocalizationConfig)
+    keyframes: KeyframeConfig = field(default_factory=KeyframeConfig)
+    triangulation: TriangulationConfig = field(default_factory=TriangulationConfig)
+    recovery: RecoveryConfig = field(default_factory=RecoveryConfig)
+    window: WindowConfig = field(default_factory=WindowConfig)
+    bundle_adjustment: BundleAdjustmentConfig = field(default_factory=BundleAdjustmentConfig)
+    cloud: CloudConfig = field(default_factory=CloudConfig)
+    snapshot: SnapshotConfig = field(default_factory=SnapshotConfig)
+    delaunay: DelaunayConfig = field(default_factory=DelaunayConfig)
+    nltgv: NltgvConfig = field(default_factory=NltgvConfig)
+    depth_rendering: DepthRenderingConfig = field(default_factory=DepthRenderingConfig)
+    fusion: FusionConfig = field(default_factory=FusionConfig)
+    surface: SurfaceConfig = field(default_factory=SurfaceConfig)
+
+
+def paper_config() -> Config:
+    """The literal paper: affine prediction (Eq. 4), no anchors, nothing found again, subspace Gauss–Newton alone."""
+    return Config(
+        mode="paper",
+        curvature=CurvatureConfig(smoothing_sigma_px=2.5),
+        extrema_tracking=ExtremaTrackingConfig(prediction="dominant_flow", gate_px=8.0, coast_frames=0),
+        recovery=RecoveryConfig(enabled=False),
+        window=WindowConfig(anchors=0),
+        bundle_adjustment=BundleAdjustmentConfig(keyframe_solver="subspace", keyframe_iterations=20),
+    )
+
+
+def dump_toml(config: Config) -> str:
+    """All settings as TOML text; a value None is left out, as TOML has none."""
+    tops, groups = [], []
+    for name, value in dataclasses.asdict(config).items():
+        if isinstance(value, dict):
+            groups.append(f"\n[{name}]\n" + "".join(f"{k} = {_toml_value(v)}\n" for k, v in value.items() if v is not None))
+        else:
+            tops.append(f"{name} = {_toml_value(value)}\n")
+    return "".join(tops + groups)
+
+
+def _toml_value(value: Any) -> str:
+    if isinstance(value, bool):
+        return str(value).lower()
+    return f'"{value}"' if isinstance(value, str) else repr(value)
+
+
+def load_toml(path: Path, base: Config | None = None) -> Config:
+    """`base` (default: `Config()`) with the settings of a TOML file.
+
+    Raises:
+        InputError: the file cannot be read, or holds a name or a type that `Config` does not have.
+    """
+    try:
+        table = tomllib.loads(path.read_text())
+    except (OSError, UnicodeDecodeError, tomllib.TOMLDecodeError) as error:
+        raise InputError(f"{path}: not a readable TOML file ({error}); see `vitamin3d config` for the format") from None
+    return _replaced(base or Config(), table, path, "")
+
+
+def _replaced(node: Any, table: dict[str, Any], path: Path, prefix: str) -> Any:
+    fields = {f.name: getattr(node, f.name) for f in dataclasses.fields(node)}
+    changes = {}
+    for name, value in table.items():
+        if name not in fields:
+            raise InputError(f"{path}: unknown setting {prefix}{name}; `vitamin3d config` lists all")
+        changes[name] = _coerced(fields[name], value, path, prefix + name)
+    return dataclasses.replace(node, **changes)
+
+
+def _coerced(old: Any, value: Any, path: Path, name: str) -> Any:
+    if dataclasses.is_dataclass(old):
+        if not isinstance(value, dict):
+            raise InputError(f"{path}: {name} is a group of settings, not a value")
+        return _replaced(old, value, path, name + ".")
+    number = (int, float) if old is None or isinstance(old, float) else type(old)
+    if not isinstance(value, number) or isinstance(value, bool) != isinstance(old, bool):
+        raise InputError(f"{path}: {name} must be like {old!r}, not {value!r}")
+    return float(value) if isinstance(old, float) or old is None else value

@@ -1,0 +1,154 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The pinhole camera with radial-tangential distortion (Brown–Conrady, OpenCV's k1 k2 p1 p2, EuRoC's `sensor.yaml`)."""
+
+from dataclasses import dataclass
+
+import cv2
+import numpy as np
+
+from vitamin3d._jit import inlined, kernel
+from vitamin3d.types import Array
+
+NEWTON_STEPS = 20
+NEWTON_TOLERANCE = 1e-10
+
+
+@inlined
+def _distort(x, y, k1, k2, p1, p2):  # type: ignore[no-untyped-def]
+    r2 = x * x + y * y
+    radial = 1.0 + r2 * (k1 + r2 * k2)
+    return x * radial + 2.0 * p1 * x * y + p2 * (r2 + 2.0 * x * x), y * radial + p1 * (r2 + 2.0 * y * y) + 2.0 * p2 * x * y
+
+
+@kernel
+def _distort_normalized(points, coefficients, out):  # type: ignore[no-untyped-def]
+    k1, k2, p1, p2 = coefficients
+    for i in range(points.shape[0]):
+        out[i, 0], out[i, 1] = _distort(points[i, 0], points[i, 1], k1, k2, p1, p2)
+
+
+@kernel
+def _undistort_normalized(points, coefficients, steps, tolerance, out):  # type: ignore[no-untyped-def]
+    """Newton's method on the distortion; NaN where it does not converge (beyond the fold of the model)."""
+    k1, k2, p1, p2 = coefficients
+    for i in range(points.shape[0]):
+        xd, yd = points[i, 0], points[i, 1]
+        x, y = xd, yd
+        error = np.inf
+        for _ in range(steps):
+            fx, fy = _distort(x, y, k1, k2, p1, p2)
+            ex, ey = fx - xd, fy - yd
+            error = ex * ex + ey * ey
+            if error < tolerance * tolerance:
+                break
+            r2 = x * x + y * y
+            radial = 1.0 + r2 * (k1 + r2 * k2)
+            slope = 2.0 * k1 + 4.0 * k2 * r2
+            jxx = radial + x * x * slope + 2.0 * p1 * y + 6.0 * p2 * x
+            jxy = x * y * slope + 2.0 * p1 * x + 2.0 * p2 * y
+            jyy = radial + y * y * slope + 6.0 * p1 * y + 2.0 * p2 * x
+            det = jxx * jyy - jxy * jxy
+            if det <= 0.0:
+                break
+            x -= (jyy * ex - jxy * ey) / det
+            y -= (jxx * ey - jxy * ex) / det
+        if error < 1e-12:
+            out[i, 0], out[i, 1] = x, y
+        else:
+            out[i, 0], out[i, 1] = np.nan, np.nan
+
+
+@dataclass(frozen=True)
+class Camera:
+    """A calibrated camera: intrinsics in pixels, distortion, picture size."""
+
+    fx: float
+    fy: float
+    cx: float
+    cy: float
+    width: int
+    height: int
+    distortion: tuple[float, float, float, float] = (0.0, 0.0, 0.0, 0.0)
+    """k1, k2, p1, p2."""
+
+    @property
+    def K(self) -> Array:
+        """(3, 3) intrinsic matrix."""
+        return np.array([[self.fx, 0.0, self.cx], [0.0, self.fy, self.cy], [0.0, 0.0, 1.0]])
+
+    @property
+    def intrinsics(self) -> Array:
+        """(4,) fx fy cx cy, for the kernels."""
+        return np.array([self.fx, self.fy, self.cx, self.cy])
+
+    @property
+    def is_distorted(self) -> bool:
+        return any(self.distortion)
+
+    def ideal_from_points(self, points_cam: Array) -> Array:
+        """Ideal pixels (N, 2) of points (N, 3) in the camera frame; NaN behind the camera."""
+        z = np.where(points_cam[:, 2] > 0, points_cam[:, 2], np.nan)
+        return np.stack([self.fx * points_cam[:, 0] / z + self.cx, self.fy * points_cam[:, 1] / z + self.cy], axis=1)
+
+    def rays_from_ideal(self, pixels: Array) -> Array:
+        """Rays (N, 3) with z = 1 of ideal pixels (N, 2)."""
+        return np.stack([(pixels[:, 0] - self.cx) / self.fx, (pixels[:, 1] - self.cy) / self.fy, np.ones(len(pixels))], axis=1)
+
+    def undistort(self, pixels: Array) -> Array:
+        """Ideal pixels (N, 2) of distorted pixels (N, 2); NaN where the model cannot be inverted."""
+        return self._mapped(pixels, inverse=True)
+
+    def distort(self, pixels: Array) -> Array:
+        """Distorted pixels (N, 2) of ideal pixels (N, 2)."""
+        return self._mapped(pixels, inverse=False)
+
+    def _mapped(self, pixels: Array, inverse: bool) -> Array:
+        if not self.is_distorted:
+            return np.array(pixels, np.float64)
+        center, focal = np.array([self.cx, self.cy]), np.array([self.fx, self.fy])
+        normalized = np.ascontiguousarray((np.asarray(pixels, np.float64) - center) / focal)
+        out = np.empty_like(normalized)
+        if inverse:
+            _undistort_normalized(normalized, np.array(self.distortion), NEWTON_STEPS, NEWTON_TOLERANCE, out)
+        else:
+            _distort_normalized(normalized, np.array(self.distortion), out)
+        return out * focal + center
+
+    def is_inside(self, pixels: Array, margin: float = 0.0) -> Array:
+        """(N,) bool: distorted pixels that lie in the picture, `margin` pixels from its border; False for NaN."""
+        u, v = pixels[:, 0], pixels[:, 1]
+        return np.asarray((u >= margin) & (v >= margin) & (u <= self.width - 1 - margin) & (v <= self.height - 1 - margin))
+
+    def canvas(self, limit: float = 0.5) -> "Camera":
+        """The undistorted camera that holds the whole picture: the same focal lengths, a wider image.
+
+        The canvas grows on each side by at most `limit` times the picture's size, for lenses whose corners
+        lie far outside.
+        """
+        if not self.is_distorted:
+            return Camera(self.fx, self.fy, self.cx, self.cy, self.width, self.height)
+        us, vs = np.arange(self.width, dtype=float), np.arange(self.height, dtype=float)
+        border = np.concatenate(
+            [np.stack(np.broadcast_arrays(u, v), -1) for u, v in ((us, 0.0), (us, self.height - 1.0), (0.0, vs), (self.width - 1.0, vs))]
+        )
+        ideal = self.undistort(border)
+        size = np.array([self.width, self.height], float)
+        low = np.maximum(np.floor(np.nanmin(ideal, axis=0)), -np.ceil(limit * size))
+        high = np.minimum(np.ceil(np.nanmax(ideal, axis=0)), size - 1 + np.ceil(limit * size))
+        left, top = np.minimum(low, 0.0)
+        width, height = (np.maximum(high, size - 1) - np.minimum(low, 0.0) + 1).astype(int)
+        return Camera(self.fx, self.fy, self.cx - left, self.cy - top, int(width), int(height))
+
+    def canvas_maps(self, canvas: "Camera") -> tuple[Array, Array]:
+        """`cv2.remap` maps (H, W) float32 that draw this camera's picture on `canvas`."""
+        grid = np.stack(np.meshgrid(np.arange(canvas.width, dtype=float), np.arange(canvas.height, dtype=float)), -1).reshape(-1, 2)
+        ideal = canvas.rays_from_ideal(grid)[:, :2] * [self.fx, self.fy] + [self.cx, self.cy]
+        source = self.distort(ideal)
+        returned = np.abs(self.undistort(source) - ideal).max(axis=1) < 0.5
+        source[~returned] = -10.0
+        source = source.reshape(canvas.height, canvas.width, 2).astype(np.float32)
+        return source[..., 0], source[..., 1]
+
+    def draw_on_canvas(self, image: Array, maps: tuple[Array, Array]) -> Array:
+        """The picture undistorted onto the canvas of `canvas_maps`; black outside."""
+        return np.asarray(cv2.remap(image, maps[0], maps[1], cv2.INTER_LINEAR))

@@ -1,0 +1,241 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Every object that crosses a module border.
+
+Conventions, here once for the whole project:
+
+* `X_a = T_a_b @ X_b`; the stored pose is `T_cam_world` (what projection needs). Camera: x right, y down, z forward.
+* Pixels are `(u, v)`, float; (0, 0) is the centre of the top-left pixel. A pixel is *distorted* (of the picture as it
+  was taken: tracks) or *ideal* (of the pinhole camera with the same focal lengths and centre, no distortion: the map).
+* Lengths are in map units until a scale is known: a monocular camera has no metre.
+* Images are uint8 or float32, geometry is float64. Invalid is NaN.
+* Time is an integer number of nanoseconds, so that time stamps come out exactly as they went in.
+"""
+
+from dataclasses import dataclass, field
+from enum import Enum
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+
+Array = npt.NDArray[Any]
+
+
+@dataclass(frozen=True)
+class Frame:
+    """A picture of the sequence."""
+
+    index: int
+    """Position in the sequence as the source numbers it (counts skipped frames)."""
+    timestamp_ns: int
+    image: Array
+    """(H, W) uint8 grey."""
+    color: Array | None = None
+    """(H, W, 3) uint8 RGB, or None where the source is grey."""
+
+
+@dataclass(frozen=True)
+class DominantFlow:
+    """Affine motion of the whole image, `y = A x + b` (Eq. 2), in distorted pixels."""
+
+    A: Array
+    """(2, 2)."""
+    b: Array
+    """(2,) pixels."""
+    inlier_ratio: float
+    """Share of the matches that follow the flow; 0 where matching failed and this is the fallback."""
+
+
+@dataclass(frozen=True)
+class FrontEndFrame:
+    """What the front end computes from pixels alone, so that it can run ahead of the map."""
+
+    frame: Frame
+    kappa: Array
+    """(H, W) float32, curvature of the smoothed image (Eq. 1); grey levels³ per pixel⁴."""
+    extrema: Array
+    """(E, 2) int32, (u, v) of all local maxima of kappa above the noise floor, strongest first."""
+    dominant_flow: DominantFlow
+    dense_flow: Array | None
+    """(H, W, 2) float32 from the previous to this frame, or None where the prediction does not use it."""
+
+
+@dataclass(frozen=True)
+class Tracks:
+    """The live tracks of one frame; arrays of one length N, sorted by nothing."""
+
+    ids: Array
+    """(N,) int64, unique; the id of a track is the id of its landmark."""
+    pixels: Array
+    """(N, 2) float64, distorted pixels."""
+    kappa: Array
+    """(N,) float32, curvature at the extremum when it was last seen."""
+    ages: Array
+    """(N,) int32, frames since the track was born."""
+    missed: Array
+    """(N,) int32, frames in a row that it coasted on its prediction; 0 = seen in this frame."""
+
+    def __len__(self) -> int:
+        return len(self.ids)
+
+    def select(self, keep: Array) -> "Tracks":
+        """The tracks of a mask (N,) bool or of indices."""
+        return Tracks(self.ids[keep], self.pixels[keep], self.kappa[keep], self.ages[keep], self.missed[keep])
+
+    @staticmethod
+    def empty() -> "Tracks":
+        return Tracks(np.zeros(0, np.int64), np.zeros((0, 2)), np.zeros(0, np.float32), np.zeros(0, np.int32), np.zeros(0, np.int32))
+
+    @staticmethod
+    def concatenate(a: "Tracks", b: "Tracks") -> "Tracks":
+        pairs = zip((a.ids, a.pixels, a.kappa, a.ages, a.missed), (b.ids, b.pixels, b.kappa, b.ages, b.missed), strict=True)
+        return Tracks(*(np.concatenate(pair) for pair in pairs))
+
+
+@dataclass(frozen=True)
+class TwoView:
+    """A first map from two frames: the first camera is the world."""
+
+    T_1_0: Array
+    """(4, 4), length of the translation 1."""
+    points_0: Array
+    """(N, 3), NaN where the point did not pass."""
+    parallax_deg: Array
+    """(N,)."""
+    is_inlier: Array
+    """(N,) bool."""
+
+
+@dataclass(frozen=True)
+class Localization:
+    """Pose of a frame against the map."""
+
+    T_cam_world: Array
+    """(4, 4)."""
+    is_inlier: Array
+    """(N,) bool, of the correspondences given."""
+    rmse_px: float
+    """Of the inliers."""
+    converged: bool
+    """False: the pose must not be used."""
+
+
+@dataclass(frozen=True)
+class BundleReport:
+    """What an adjustment did."""
+
+    costs: Array
+    """(I + 1,) robust cost before the first and after each sweep, the objective that is minimised."""
+    converged: bool
+    num_observations: int
+    rmse_px: float
+    """Root mean square reprojection error of the observations below three sigmas."""
+
+
+@dataclass(frozen=True)
+class MapSnapshot:
+    """A keyframe with the depths of its landmarks; the only message from the sparse to the dense half."""
+
+    frame: Frame
+    T_cam_world: Array
+    """(4, 4)."""
+    pixels: Array
+    """(N, 2) ideal pixels: where the landmarks project."""
+    depths: Array
+    """(N,) along z, map units."""
+    relative_deviations: Array
+    """(N,) standard deviation of the depth divided by the depth."""
+
+
+@dataclass(frozen=True)
+class ImageMesh:
+    """A triangulation of a keyframe's landmarks in the image."""
+
+    pixels: Array
+    """(V, 2) float64 ideal pixels."""
+    triangles: Array
+    """(F, 3) int32."""
+    edges: Array
+    """(E, 2) int32, each edge once."""
+    inverse_depth: Array
+    """(V,) float64, per map unit."""
+    weight: Array
+    """(V,) float64, data weight of NLTGV."""
+
+
+@dataclass(frozen=True)
+class DepthView:
+    """Depth and normals of a keyframe, rasterised on the canvas camera (the whole undistorted picture)."""
+
+    timestamp_ns: int
+    T_cam_world: Array
+    """(4, 4)."""
+    depth: Array
+    """(H, W) float32 along z, map units; 0 = none."""
+    normals_cam: Array
+    """(H, W, 3) float32 unit vectors in the camera frame, towards the camera; 0 = none."""
+    color: Array
+    """(H, W, 3) uint8 RGB (grey pictures: three equal channels)."""
+
+
+@dataclass(frozen=True)
+class Surface:
+    """A triangle mesh."""
+
+    vertices_world: Array
+    """(V, 3) float64."""
+    triangles: Array
+    """(F, 3) int32."""
+    normals_world: Array
+    """(V, 3) float64, unit."""
+    colors: Array
+    """(V, 3) uint8 RGB."""
+
+
+@dataclass(frozen=True)
+class PointCloud:
+    """The landmarks of a map that passed the export's filter."""
+
+    points_world: Array
+    """(N, 3) float64."""
+    colors: Array
+    """(N, 3) uint8 RGB."""
+    num_observations: Array
+    """(N,) int32, in keyframes."""
+    parallax_deg: Array
+    """(N,) float32, largest angle between two of its rays."""
+    reprojection_rms_px: Array
+    """(N,) float32."""
+    depth_deviation: Array
+    """(N,) float32, standard deviation along the ray divided by the depth."""
+
+
+@dataclass(frozen=True)
+class Trajectory:
+    """Poses in time."""
+
+    timestamps_ns: Array
+    """(T,) int64, ascending."""
+    T_world_cam: Array
+    """(T, 4, 4), camera to world."""
+
+    def __len__(self) -> int:
+        return len(self.timestamps_ns)
+
+
+class SlamState(Enum):
+    """What the tracker is doing after a frame."""
+
+    INITIALIZING = "initializing"
+    TRACKING = "tracking"
+    LOST = "lost"
+
+
+@dataclass
+class StepTimes:
+    """Milliseconds of each step, by name; grows while a run lasts."""
+
+    milliseconds: dict[str, list[float]] = field(default_factory=dict)
+
+    def add(self, step: str, seconds: float) -> None:
+        self.milliseconds.setdefault(step, []).append(1e3 * seconds)
