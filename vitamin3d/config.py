@@ -83,6 +83,8 @@ class InitializationConfig:
 
 @dataclass(frozen=True)
 class LocalizationConfig:
+    prior_inlier_ratio: float = 0.6
+    """Where the motion model explains this share of the landmarks, RANSAC is skipped; above 1: never."""
     ransac_points: int = 400
     ransac_iterations: int = 100
     ransac_threshold_px: float = 4.0
@@ -164,6 +166,8 @@ class SnapshotConfig:
 @dataclass(frozen=True)
 class DelaunayConfig:
     min_vertices: int = 30
+    min_separation_px: float = 1.0
+    """Of two landmarks nearer than this in the image, the more certain one becomes a vertex."""
     weight_scale: float = 0.02
     """Data weight of a vertex = weight_scale / relative deviation of its depth, at most max_weight."""
     max_weight: float = 20.0
@@ -245,6 +249,7 @@ def paper_config() -> Config:
         mode="paper",
         curvature=CurvatureConfig(smoothing_sigma_px=2.5),
         extrema_tracking=ExtremaTrackingConfig(prediction="dominant_flow", gate_px=8.0, coast_frames=0),
+        localization=LocalizationConfig(prior_inlier_ratio=2.0),
         recovery=RecoveryConfig(enabled=False),
         window=WindowConfig(anchors=0),
         bundle_adjustment=BundleAdjustmentConfig(keyframe_solver="subspace", keyframe_iterations=20),

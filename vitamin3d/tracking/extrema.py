@@ -1,0 +1,116 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Local maxima of the curvature: the features of the method (Sec. 2.1)."""
+
+import numpy as np
+
+from vitamin3d._jit import inlined, kernel
+from vitamin3d.config import ExtremaConfig
+from vitamin3d.types import Array
+
+CELL_PX = 32
+
+
+@kernel
+def _local_maxima(kappa, floor, border, out):  # type: ignore[no-untyped-def]
+    """Pixels above `floor` that exceed their four earlier neighbours and are not below their four later ones."""
+    height, width = kappa.shape
+    count = 0
+    for v in range(border, height - border):
+        for u in range(border, width - border):
+            k = kappa[v, u]
+            if k <= floor or k <= kappa[v, u - 1] or k < kappa[v, u + 1]:
+                continue
+            if k <= kappa[v - 1, u - 1] or k <= kappa[v - 1, u] or k <= kappa[v - 1, u + 1]:
+                continue
+            if k < kappa[v + 1, u - 1] or k < kappa[v + 1, u] or k < kappa[v + 1, u + 1]:
+                continue
+            out[count, 0] = u
+            out[count, 1] = v
+            count += 1
+    return count
+
+
+@inlined
+def subpixel_offset(below, center, above):  # type: ignore[no-untyped-def]
+    """Where the parabola through three samples at -1, 0, 1 has its maximum; within half a pixel."""
+    bend = below - 2.0 * center + above
+    if bend >= 0.0:
+        return 0.0
+    return min(0.5, max(-0.5, 0.5 * (below - above) / bend))
+
+
+@kernel
+def _refine(kappa, extrema, out):  # type: ignore[no-untyped-def]
+    for i in range(extrema.shape[0]):
+        u, v = extrema[i, 0], extrema[i, 1]
+        out[i, 0] = u + subpixel_offset(kappa[v, u - 1], kappa[v, u], kappa[v, u + 1])
+        out[i, 1] = v + subpixel_offset(kappa[v - 1, u], kappa[v, u], kappa[v + 1, u])
+
+
+@kernel
+def _free_extrema(extrema, occupied, radius, keep):  # type: ignore[no-untyped-def]
+    """Greedy, in the given order: keeps an extremum where nothing is within `radius`, then occupies its place."""
+    height, width = occupied.shape
+    for i in range(extrema.shape[0]):
+        u, v = extrema[i, 0], extrema[i, 1]
+        keep[i] = not occupied[v, u]
+        if keep[i]:
+            occupied[max(0, v - radius) : min(height, v + radius + 1), max(0, u - radius) : min(width, u + radius + 1)] = True
+
+
+@kernel
+def _occupy(pixels, radius, occupied):  # type: ignore[no-untyped-def]
+    height, width = occupied.shape
+    for i in range(pixels.shape[0]):
+        u, v = int(round(pixels[i, 0])), int(round(pixels[i, 1]))
+        occupied[max(0, v - radius) : max(0, min(height, v + radius + 1)), max(0, u - radius) : max(0, min(width, u + radius + 1))] = True
+
+
+def detect_extrema(kappa: Array, config: ExtremaConfig) -> Array:
+    """All local maxima (E, 2) int32 `u v` of kappa (H, W) above the noise floor, strongest first."""
+    buffer = np.empty((kappa.size // 2 + 1, 2), np.int32)
+    extrema = buffer[: _local_maxima(kappa, np.float32(config.min_curvature), max(1, config.border_px), buffer)]
+    return extrema[np.argsort(-kappa[extrema[:, 1], extrema[:, 0]], kind="stable")]
+
+
+def refine_extrema(kappa: Array, extrema: Array) -> Array:
+    """Sub-pixel positions (E, 2) float64 of extrema (E, 2) int by a parabola in each direction."""
+    out = np.empty((len(extrema), 2))
+    _refine(kappa, extrema, out)
+    return out
+
+
+def select_free_extrema(extrema: Array, live_pixels: Array, shape: tuple[int, int], config: ExtremaConfig) -> Array:
+    """Extrema to start as new tracks: away from live tracks, emptiest cells first, strongest first within a cell.
+
+    Args:
+        extrema: (E, 2) int32, strongest first.
+        live_pixels: (N, 2) positions of the live tracks.
+        shape: of the image, (height, width).
+
+    Returns:
+        (at most max_tracks - N, 2) int32.
+    """
+    room = config.max_tracks - len(live_pixels)
+    if room <= 0:
+        return extrema[:0]
+    occupied = np.zeros(shape, np.bool_)
+    radius = int(config.min_distance_px) // 2
+    _occupy(live_pixels, radius, occupied)
+    keep = np.empty(len(extrema), np.bool_)
+    _free_extrema(extrema, occupied, radius, keep)
+    free = extrema[keep]
+    return free[np.argsort(_rank_in_cell(free, live_pixels, shape[1]), kind="stable")[:room]]
+
+
+def _rank_in_cell(free: Array, live_pixels: Array, width: int) -> Array:
+    """For each extremum, how many tracks its cell holds before it: the live ones and the stronger free ones."""
+    columns = width // CELL_PX + 1
+    cell = (free[:, 1] // CELL_PX) * columns + free[:, 0] // CELL_PX
+    live = np.maximum(live_pixels, 0).astype(np.int64) // CELL_PX
+    counts = np.bincount(live[:, 1] * columns + live[:, 0], minlength=int(cell.max(initial=0)) + 1)
+    order = np.argsort(cell, kind="stable")
+    first = np.searchsorted(cell[order], cell[order])
+    rank = np.empty(len(free), np.int64)
+    rank[order] = np.arange(len(free)) - first
+    return np.asarray(rank + counts[cell])

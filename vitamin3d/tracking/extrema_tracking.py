@@ -1,0 +1,107 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Curvature extrema tracking (Sec. 2.3): predict by the flow (Eq. 4), climb kappa + lambda w (Eq. 5), prune."""
+
+import numpy as np
+
+from vitamin3d._jit import inlined, kernel
+from vitamin3d.config import ExtremaTrackingConfig
+from vitamin3d.tracking.extrema import subpixel_offset
+from vitamin3d.types import Array, DominantFlow, Tracks
+
+
+@inlined
+def climb(kappa, u, v, predicted_u, predicted_v, weight, squared_sigma, max_steps):  # type: ignore[no-untyped-def]
+    """Hill climbing over eight neighbours of F (Eq. 5) from pixel (u, v); the last pixel and whether it is a maximum."""
+    height, width = kappa.shape
+    best = kappa[v, u] + weight * squared_sigma / ((u - predicted_u) ** 2 + (v - predicted_v) ** 2 + squared_sigma)
+    for _ in range(max_steps + 1):
+        best_u, best_v = u, v
+        for n in range(v - 1, v + 2):
+            for m in range(u - 1, u + 2):
+                value = kappa[n, m] + weight * squared_sigma / ((m - predicted_u) ** 2 + (n - predicted_v) ** 2 + squared_sigma)
+                if value > best:
+                    best, best_u, best_v = value, m, n
+        if best_u == u and best_v == v:
+            return u, v, True
+        u, v = best_u, best_v
+        if u < 1 or v < 1 or u >= width - 1 or v >= height - 1:
+            return u, v, False
+    return u, v, False
+
+
+@kernel
+def _climb_all(kappa, predicted, weight, sigma, max_steps, gate, out, out_kappa, found):  # type: ignore[no-untyped-def]
+    """Climbs from each prediction (N, 2); `found` where a positive maximum lies within `gate` of it."""
+    height, width = kappa.shape
+    for i in range(predicted.shape[0]):
+        pu, pv = predicted[i, 0], predicted[i, 1]
+        out[i, 0], out[i, 1], out_kappa[i], found[i] = pu, pv, 0.0, False
+        u, v = int(round(pu)), int(round(pv))
+        if not (u >= 1 and v >= 1 and u < width - 1 and v < height - 1):
+            continue
+        u, v, is_maximum = climb(kappa, u, v, pu, pv, weight, sigma * sigma, max_steps)
+        if not is_maximum or kappa[v, u] <= 0.0:
+            continue
+        x = u + subpixel_offset(kappa[v, u - 1], kappa[v, u], kappa[v, u + 1])
+        y = v + subpixel_offset(kappa[v - 1, u], kappa[v, u], kappa[v + 1, u])
+        if (x - pu) ** 2 + (y - pv) ** 2 <= gate * gate:
+            out[i, 0], out[i, 1], out_kappa[i], found[i] = x, y, kappa[v, u], True
+
+
+@kernel
+def _sample_flow(flow, pixels, out):  # type: ignore[no-untyped-def]
+    """pixels + bilinear sample of flow (H, W, 2), clamped to the image."""
+    height, width = flow.shape[:2]
+    for i in range(pixels.shape[0]):
+        x = min(max(pixels[i, 0], 0.0), width - 1.001)
+        y = min(max(pixels[i, 1], 0.0), height - 1.001)
+        u, v = int(x), int(y)
+        a, b = x - u, y - v
+        for c in range(2):
+            top = (1.0 - a) * flow[v, u, c] + a * flow[v, u + 1, c]
+            bottom = (1.0 - a) * flow[v + 1, u, c] + a * flow[v + 1, u + 1, c]
+            out[i, c] = pixels[i, c] + (1.0 - b) * top + b * bottom
+
+
+def predict_by_dominant_flow(pixels: Array, flow: DominantFlow) -> Array:
+    """Predictions (N, 2) of pixels (N, 2): A x + b (Eq. 4)."""
+    return np.asarray(pixels @ flow.A.T + flow.b)
+
+
+def predict_by_dense_flow(pixels: Array, flow: Array) -> Array:
+    """Predictions (N, 2) of pixels (N, 2) by a flow field (H, W, 2)."""
+    out = np.empty((len(pixels), 2))
+    _sample_flow(flow, np.ascontiguousarray(pixels, np.float64), out)
+    return out
+
+
+def track_extrema(tracks: Tracks, predicted: Array, kappa: Array, config: ExtremaTrackingConfig) -> Tracks:
+    """The tracks in the current image: those found, and those that coast on their prediction.
+
+    Args:
+        tracks: of the previous image.
+        predicted: (N, 2) their predicted pixels.
+        kappa: (H, W) float32 of the current image.
+
+    Returns:
+        Tracks, `missed` > 0 where no extremum was found; tracks that meet on one pixel are merged into the oldest.
+    """
+    n = len(tracks)
+    pixels, values, found = np.empty((n, 2)), np.empty(n, np.float32), np.empty(n, np.bool_)
+    weight, sigma = config.prediction_weight, config.prediction_sigma_px
+    _climb_all(kappa, np.ascontiguousarray(predicted), weight, sigma, config.max_steps, config.gate_px, pixels, values, found)
+    missed = np.where(found, 0, tracks.missed + 1).astype(np.int32)
+    kept = np.where(found, values, tracks.kappa).astype(np.float32)
+    moved = Tracks(tracks.ids, pixels, kept, tracks.ages + np.int32(1), missed)
+    height, width = kappa.shape
+    inside = (pixels > 1).all(axis=1) & (pixels < [width - 2, height - 2]).all(axis=1)
+    return merge_meeting_tracks(moved.select((missed <= config.coast_frames) & inside), width)
+
+
+def merge_meeting_tracks(tracks: Tracks, width: int) -> Tracks:
+    """One track per pixel: a seen one before a coasting one, then the oldest, then the lowest id."""
+    place = np.rint(tracks.pixels).astype(np.int64) @ np.array([1, width])
+    order = np.lexsort((tracks.ids, -tracks.ages, tracks.missed, place))
+    first = np.ones(len(order), np.bool_)
+    first[1:] = place[order][1:] != place[order][:-1]
+    return tracks.select(np.sort(order[first]))

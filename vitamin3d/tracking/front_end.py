@@ -1,0 +1,52 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The part of the front end that needs pixels only, so that a thread can run it ahead of the map."""
+
+import time
+
+import cv2
+import numpy as np
+
+from vitamin3d.config import Config
+from vitamin3d.tracking.curvature import curvature
+from vitamin3d.tracking.dominant_flow import CoarseFeatures, coarse_features, estimate_dominant_flow
+from vitamin3d.tracking.extrema import detect_extrema
+from vitamin3d.types import Array, DominantFlow, Frame, FrontEndFrame, StepTimes
+
+IDENTITY_FLOW = DominantFlow(np.eye(2), np.zeros(2), 0.0)
+
+
+class FrontEnd:
+    """Turns consecutive frames into curvature, extrema and flow; remembers the previous picture."""
+
+    def __init__(self, config: Config) -> None:
+        self.config = config
+        self.times = StepTimes()
+        self._dis = cv2.DISOpticalFlow_create(cv2.DISOPTICAL_FLOW_PRESET_ULTRAFAST)
+        self._previous: Array | None = None
+        self._features: CoarseFeatures | None = None
+        self._dominant_flow = IDENTITY_FLOW
+
+    def process(self, frame: Frame) -> FrontEndFrame:
+        """Curvature (Eq. 1), its maxima (Sec. 2.1) and the flow since the previous frame (Sec. 2.2)."""
+        start = time.perf_counter()
+        kappa = curvature(frame.image, self.config.curvature)
+        extrema = detect_extrema(kappa, self.config.extrema)
+        after_extrema = time.perf_counter()
+        flow = self._dense_flow(frame.image)
+        if flow is None:
+            self._update_dominant_flow(frame.image)
+        self._previous = frame.image
+        self.times.add("curvature_extrema", after_extrema - start)
+        self.times.add("flow", time.perf_counter() - after_extrema)
+        return FrontEndFrame(frame, kappa, extrema, self._dominant_flow, flow)
+
+    def _dense_flow(self, image: Array) -> Array | None:
+        """DIS flow (H, W, 2) from the previous picture, where the settings ask for it and there is one to match."""
+        if self.config.extrema_tracking.prediction != "dense_flow" or self._previous is None:
+            return None
+        return np.asarray(self._dis.calc(self._previous, image, None))
+
+    def _update_dominant_flow(self, image: Array) -> None:
+        features = coarse_features(image, self.config.dominant_flow)
+        self._dominant_flow = estimate_dominant_flow(self._features, features, self._dominant_flow, self.config.dominant_flow)
+        self._features = features
