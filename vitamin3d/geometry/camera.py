@@ -112,7 +112,7 @@ class Camera:
             _undistort_normalized(normalized, np.array(self.distortion), NEWTON_STEPS, NEWTON_TOLERANCE, out)
         else:
             _distort_normalized(normalized, np.array(self.distortion), out)
-        return out * focal + center
+        return np.asarray(out * focal + center)
 
     def is_inside(self, pixels: Array, margin: float = 0.0) -> Array:
         """(N,) bool: distorted pixels that lie in the picture, `margin` pixels from its border; False for NaN."""

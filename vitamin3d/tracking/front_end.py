@@ -21,7 +21,7 @@ class FrontEnd:
     def __init__(self, config: Config) -> None:
         self.config = config
         self.times = StepTimes()
-        self._dis = cv2.DISOpticalFlow_create(cv2.DISOPTICAL_FLOW_PRESET_ULTRAFAST)
+        self._dis = cv2.DISOpticalFlow_create(cv2.DISOPTICAL_FLOW_PRESET_ULTRAFAST)  # type: ignore[attr-defined]
         self._previous: Array | None = None
         self._features: CoarseFeatures | None = None
         self._dominant_flow = IDENTITY_FLOW

@@ -1,0 +1,139 @@
+# SPDX-License-Identifier: Apache-2.0
+"""What the map knows about its landmarks: observations, parallax, reprojection error, deviation of the depth."""
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from vitamin3d._jit import kernel
+from vitamin3d.config import CloudConfig, SnapshotConfig
+from vitamin3d.geometry.camera import Camera
+from vitamin3d.geometry.reprojection import linearize, squared_error
+from vitamin3d.geometry.se3 import inverse
+from vitamin3d.mapping.sparse_map import SparseMap
+from vitamin3d.types import Array, PointCloud
+
+
+@kernel
+def _information(intrinsics, R, t, starts, obs_landmark, obs_valid, obs_pixels, first, points, wanted, H):  # type: ignore[no-untyped-def]
+    """Adds JᵀJ (3, 3) of each counting observation of each wanted landmark to H (L, 3, 3), at its number in `wanted`."""
+    r, J_pose, J = np.empty(2), np.empty((2, 6)), np.empty((2, 3))
+    for k in range(R.shape[0]):
+        for i in range(starts[k], starts[k + 1]):
+            id_ = obs_landmark[i]
+            at = wanted[id_]
+            if at < 0 or not obs_valid[i] or i < first[id_]:
+                continue
+            if linearize(intrinsics, R[k], t[k], points[id_], obs_pixels[i], r, J_pose, J):
+                for m in range(3):
+                    for n in range(3):
+                        H[at, m, n] += J[0, m] * J[0, n] + J[1, m] * J[1, n]
+
+
+@kernel
+def _accumulate(intrinsics, R, t, centers, starts, obs_landmark, obs_valid, obs_pixels, first, points, count, squared, low, reference):  # type: ignore[no-untyped-def]
+    """Per landmark: observations, sum of squared errors, and the smallest cosine between a ray and its reference ray."""
+    for k in range(R.shape[0]):
+        for i in range(starts[k], starts[k + 1]):
+            id_ = obs_landmark[i]
+            if not obs_valid[i] or i < first[id_] or np.isnan(points[id_, 0]):
+                continue
+            count[id_] += 1
+            squared[id_] += squared_error(intrinsics, R[k], t[k], points[id_], obs_pixels[i])
+            x, y, z = points[id_, 0] - centers[k, 0], points[id_, 1] - centers[k, 1], points[id_, 2] - centers[k, 2]
+            norm = np.sqrt(x * x + y * y + z * z)
+            if np.isnan(reference[id_, 0]):
+                reference[id_, 0], reference[id_, 1], reference[id_, 2] = x / norm, y / norm, z / norm
+            cosine = (x * reference[id_, 0] + y * reference[id_, 1] + z * reference[id_, 2]) / norm
+            low[id_] = min(low[id_], cosine)
+
+
+@dataclass(frozen=True)
+class LandmarkStatistics:
+    """By landmark id; zeros for tracks that are no landmarks."""
+
+    num_observations: Array
+    """(L,) int32, in keyframes."""
+    reprojection_rms_px: Array
+    """(L,)."""
+    parallax_deg: Array
+    """(L,) largest angle between the first ray and another."""
+
+
+def landmark_statistics(sparse_map: SparseMap, camera: Camera) -> LandmarkStatistics:
+    """Observations, reprojection error and parallax of all landmarks."""
+    size = len(sparse_map.points_world)
+    count, squared, low = np.zeros(size, np.int32), np.zeros(size), np.ones(size)
+    poses = sparse_map.T_cam_world
+    centers = np.ascontiguousarray(inverse(poses)[:, :3, 3])
+    R, t = np.ascontiguousarray(poses[:, :3, :3]), np.ascontiguousarray(poses[:, :3, 3])
+    _accumulate(
+        camera.intrinsics, R, t, centers, np.array(sparse_map.keyframe_starts), sparse_map.obs_landmark, sparse_map.obs_valid,
+        sparse_map.obs_pixels, sparse_map.first_observation, sparse_map.points_world, count, squared, low, np.full((size, 3), np.nan),
+    )  # fmt: skip
+    parallax = np.degrees(np.arccos(np.clip(low, -1.0, 1.0)))
+    return LandmarkStatistics(count, np.sqrt(squared / np.maximum(count, 1)), parallax)
+
+
+def landmark_information(sparse_map: SparseMap, ids: Array, camera: Camera, sigma_px: float) -> Array:
+    """Inverse covariance (N, 3, 3) of landmarks (N,) ids, in the world, for observations good to sigma_px."""
+    wanted = np.full(len(sparse_map.points_world), -1, np.int64)
+    wanted[ids] = np.arange(len(ids))
+    poses, H = sparse_map.T_cam_world, np.zeros((len(ids), 3, 3))
+    R, t = np.ascontiguousarray(poses[:, :3, :3]), np.ascontiguousarray(poses[:, :3, 3])
+    _information(
+        camera.intrinsics, R, t, np.array(sparse_map.keyframe_starts), sparse_map.obs_landmark, sparse_map.obs_valid,
+        sparse_map.obs_pixels, sparse_map.first_observation, sparse_map.points_world, wanted, H,
+    )  # fmt: skip
+    return H / sigma_px**2
+
+
+def relative_depth_deviations(information: Array, points_world: Array, T_cam_world: Array) -> Array:
+    """Standard deviation of the depth z over the depth, (N,), seen from a camera; inf where it is undetermined.
+
+    Args:
+        information: (N, 3, 3) inverse covariances in the world.
+        points_world: (N, 3).
+        T_cam_world: (4, 4) or (N, 4, 4).
+    """
+    regular = np.linalg.det(information) > 1e-12 * np.einsum("nii->n", information) ** 3 * 1e-6
+    covariance = np.full_like(information, np.inf)
+    covariance[regular] = np.linalg.inv(information[regular])
+    axis = np.broadcast_to(T_cam_world[..., 2, :3], points_world.shape)
+    depth = (axis * points_world).sum(axis=1) + T_cam_world[..., 2, 3]
+    with np.errstate(invalid="ignore"):
+        variance = np.einsum("ni,nij,nj->n", axis, covariance, axis)
+    return np.where(regular, np.sqrt(np.maximum(variance, 0.0)) / np.maximum(depth, 1e-12), np.inf)
+
+
+def keyframe_vertices(sparse_map: SparseMap, keyframe: int, camera: Camera, config: SnapshotConfig) -> tuple[Array, Array, Array]:
+    """The landmarks observed in a keyframe: ideal pixels of their projections (N, 2), depths (N,), relative deviations (N,)."""
+    rows = sparse_map.observations_of(keyframe)
+    ids = sparse_map.obs_landmark[rows]
+    good = sparse_map.obs_valid[rows] & sparse_map.is_mapped(ids) & (sparse_map.num_observations[ids] >= config.min_observations)
+    ids = ids[good]
+    points, T = sparse_map.points_world[ids], sparse_map.T_cam_world[keyframe]
+    in_camera = points @ T[:3, :3].T + T[:3, 3]
+    information = landmark_information(sparse_map, ids, camera, config.observation_sigma_px)
+    deviations = relative_depth_deviations(information, points, T)
+    usable = (in_camera[:, 2] > 0) & (deviations < config.max_relative_deviation)
+    return camera.ideal_from_points(in_camera[usable]), in_camera[usable, 2], deviations[usable]
+
+
+def point_cloud(sparse_map: SparseMap, camera: Camera, config: CloudConfig, sigma_px: float) -> PointCloud:
+    """The landmarks that pass the export's filter, with what is known about them."""
+    statistics = landmark_statistics(sparse_map, camera)
+    good = ~np.isnan(sparse_map.points_world[:, 0]) & (statistics.num_observations >= config.min_observations)
+    good &= (statistics.parallax_deg >= config.min_parallax_deg) & (statistics.reprojection_rms_px <= config.max_reprojection_rms_px)
+    ids = np.flatnonzero(good)
+    points = sparse_map.points_world[ids]
+    information = landmark_information(sparse_map, ids, camera, sigma_px)
+    last_seen_from = sparse_map.T_cam_world[sparse_map.keyframe_of(sparse_map.last_observation[ids])]
+    return PointCloud(
+        points,
+        sparse_map.colors[ids],
+        statistics.num_observations[ids],
+        statistics.parallax_deg[ids].astype(np.float32),
+        statistics.reprojection_rms_px[ids].astype(np.float32),
+        relative_depth_deviations(information, points, last_seen_from).astype(np.float32),
+    )

@@ -1,0 +1,49 @@
+# SPDX-License-Identifier: Apache-2.0
+"""New landmarks from tracks that have gained enough parallax (Sec. 5.1)."""
+
+import numpy as np
+
+from vitamin3d.config import TriangulationConfig
+from vitamin3d.geometry.camera import Camera
+from vitamin3d.geometry.se3 import inverse
+from vitamin3d.geometry.triangulation import triangulate
+from vitamin3d.mapping.sparse_map import SparseMap
+from vitamin3d.types import Array
+
+
+def triangulate_landmarks(sparse_map: SparseMap, camera: Camera, config: TriangulationConfig) -> int:
+    """Gives points to the newest keyframe's tracks that have none, from their first and their newest observation.
+
+    A point must have the parallax, lie in front of both cameras and reproject well in both.
+
+    Returns:
+        The number of new landmarks.
+    """
+    newest = sparse_map.num_keyframes - 1
+    rows = np.arange(*sparse_map.observations_of(newest).indices(len(sparse_map.obs_landmark)))
+    ids = sparse_map.obs_landmark[rows]
+    first = sparse_map.first_observation[ids]
+    pending = ~sparse_map.is_mapped(ids) & (first >= 0) & (first < rows[0]) & sparse_map.obs_valid[rows]
+    pending[pending] &= sparse_map.num_observations[ids[pending]] >= config.min_observations
+    rows, ids, first = rows[pending], ids[pending], first[pending]
+    points, good = _two_ray_points(sparse_map, first, rows, camera, config)
+    sparse_map.points_world[ids[good]] = points[good]
+    return int(good.sum())
+
+
+def _two_ray_points(
+    sparse_map: SparseMap, first: Array, newest: Array, camera: Camera, config: TriangulationConfig
+) -> tuple[Array, Array]:
+    """World points (N, 3) of two observations each, and which of them (N,) pass the gates."""
+    T_a_world = sparse_map.T_cam_world[sparse_map.keyframe_of(first)]
+    T_b_world = sparse_map.T_cam_world[-1]
+    pixels_a, pixels_b = sparse_map.obs_pixels[first], sparse_map.obs_pixels[newest]
+    T_world_a = inverse(T_a_world)
+    points_a, parallax = triangulate(camera.rays_from_ideal(pixels_a), camera.rays_from_ideal(pixels_b), T_b_world @ T_world_a)
+    points = np.einsum("nij,nj->ni", T_world_a[:, :3, :3], points_a) + T_world_a[:, :3, 3]
+    points_b = points @ T_b_world[:3, :3].T + T_b_world[:3, 3]
+    with np.errstate(invalid="ignore"):
+        error_a = np.linalg.norm(camera.ideal_from_points(points_a) - pixels_a, axis=1)
+        error_b = np.linalg.norm(camera.ideal_from_points(points_b) - pixels_b, axis=1)
+        good = (parallax >= config.min_parallax_deg) & (np.maximum(error_a, error_b) <= config.max_reprojection_px)
+    return points, good

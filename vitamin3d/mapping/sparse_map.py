@@ -1,0 +1,190 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The sparse map: keyframes, landmarks and observations as growing arrays; one owner writes it.
+
+The id of a landmark is the id of its track, given at the track's birth. A track's observations are stored from its
+first keyframe on; it becomes a landmark when it gets a point (`points_world` is NaN until then), and its older
+observations count from that moment.
+"""
+
+import numpy as np
+
+from vitamin3d.types import Array
+
+PATCH_PX = 9
+
+
+class _Growing:
+    """An array whose first axis grows by doubling; `view` is the used part."""
+
+    def __init__(self, shape: tuple[int, ...], dtype: type, fill: float) -> None:
+        self._data: Array = np.full((1024, *shape), fill, dtype)
+        self._fill = fill
+        self.size = 0
+
+    @property
+    def view(self) -> Array:
+        return self._data[: self.size]
+
+    def resize(self, size: int) -> None:
+        if size > len(self._data):
+            grown = np.full((max(size, 2 * len(self._data)), *self._data.shape[1:]), self._fill, self._data.dtype)
+            grown[: self.size] = self._data[: self.size]
+            self._data = grown
+        self.size = max(self.size, size)
+
+    def append(self, values: Array) -> None:
+        start = self.size
+        self.resize(start + len(values))
+        self._data[start : self.size] = values
+
+
+class SparseMap:
+    """Keyframes (K), landmarks (L, by id) and observations (M, in keyframe order)."""
+
+    def __init__(self) -> None:
+        self.frame_indices: list[int] = []
+        self.timestamps_ns: list[int] = []
+        self.keyframe_starts: list[int] = [0]
+        self._poses = _Growing((4, 4), np.float64, 0.0)
+        self._obs_landmark = _Growing((), np.int64, -1)
+        self._obs_pixels = _Growing((2,), np.float64, np.nan)
+        self._obs_valid = _Growing((), np.bool_, False)
+        self._points = _Growing((3,), np.float64, np.nan)
+        self._first = _Growing((), np.int64, -1)
+        self._last = _Growing((), np.int64, -1)
+        self._count = _Growing((), np.int32, 0)
+        self._colors = _Growing((3,), np.uint8, 0)
+        self._patches = _Growing((PATCH_PX * PATCH_PX,), np.uint8, 0)
+
+    @property
+    def num_keyframes(self) -> int:
+        return len(self.frame_indices)
+
+    @property
+    def T_cam_world(self) -> Array:
+        """(K, 4, 4) poses of the keyframes; a view."""
+        return self._poses.view
+
+    @property
+    def points_world(self) -> Array:
+        """(L, 3) by landmark id, NaN where the track is no landmark; a view."""
+        return self._points.view
+
+    @property
+    def num_observations(self) -> Array:
+        """(L,) int32 by landmark id: valid observations in keyframes; a view."""
+        return self._count.view
+
+    @property
+    def last_observation(self) -> Array:
+        """(L,) index of the latest observation by landmark id, -1 for none; a view."""
+        return self._last.view
+
+    @property
+    def first_observation(self) -> Array:
+        """(L,) index of the earliest observation that counts by landmark id, -1 for none; a view."""
+        return self._first.view
+
+    @property
+    def patches(self) -> Array:
+        """(L, 81) uint8: the 9×9 pixels around the latest observation; a view."""
+        return self._patches.view
+
+    @property
+    def colors(self) -> Array:
+        """(L, 3) uint8 RGB of the latest observation; a view."""
+        return self._colors.view
+
+    @property
+    def obs_landmark(self) -> Array:
+        """(M,) landmark id of each observation; a view."""
+        return self._obs_landmark.view
+
+    @property
+    def obs_pixels(self) -> Array:
+        """(M, 2) ideal pixels; a view."""
+        return self._obs_pixels.view
+
+    @property
+    def obs_valid(self) -> Array:
+        """(M,) bool; False: removed as an outlier; a view."""
+        return self._obs_valid.view
+
+    @property
+    def obs_keyframe(self) -> Array:
+        """(M,) keyframe of each observation."""
+        return np.repeat(np.arange(self.num_keyframes), np.diff(self.keyframe_starts))
+
+    def keyframe_of(self, observations: Array) -> Array:
+        """Keyframe of observation indices (N,)."""
+        return np.asarray(np.searchsorted(self.keyframe_starts, observations, side="right") - 1)
+
+    def observations_of(self, keyframe: int) -> slice:
+        """The observations of a keyframe, as a slice of the `obs_` arrays."""
+        return slice(self.keyframe_starts[keyframe], self.keyframe_starts[keyframe + 1])
+
+    def is_mapped(self, ids: Array) -> Array:
+        """(N,) bool: which track ids (N,) are landmarks."""
+        known = ids < self._points.size
+        out = np.zeros(len(ids), np.bool_)
+        out[known] = ~np.isnan(self.points_world[ids[known], 0])
+        return out
+
+    def add_keyframe(
+        self, frame_index: int, timestamp_ns: int, T_cam_world: Array, ids: Array, pixels: Array, colors: Array, patches: Array
+    ) -> int:
+        """Adds a keyframe with the observations of all its tracks, landmarks or not.
+
+        Args:
+            T_cam_world: (4, 4).
+            ids: (N,) track ids.
+            pixels: (N, 2) ideal pixels.
+            colors: (N, 3) uint8.
+            patches: (N, 81) uint8.
+
+        Returns:
+            The index of the keyframe.
+        """
+        start = self._obs_landmark.size
+        self.frame_indices.append(frame_index)
+        self.timestamps_ns.append(timestamp_ns)
+        self._poses.append(T_cam_world[None])
+        self._obs_landmark.append(ids)
+        self._obs_pixels.append(pixels)
+        self._obs_valid.append(np.ones(len(ids), np.bool_))
+        self.keyframe_starts.append(self._obs_landmark.size)
+        self._touch_landmarks(ids, np.arange(start, self._obs_landmark.size), colors, patches)
+        return self.num_keyframes - 1
+
+    def _touch_landmarks(self, ids: Array, observations: Array, colors: Array, patches: Array) -> None:
+        size = int(ids.max(initial=-1)) + 1
+        for array in (self._points, self._first, self._last, self._count, self._colors, self._patches):
+            array.resize(size)
+        is_new = self._first.view[ids] < 0
+        self._first.view[ids[is_new]] = observations[is_new]
+        self._last.view[ids] = observations
+        self._count.view[ids] += 1
+        self._colors.view[ids] = colors
+        self._patches.view[ids] = patches
+
+    def remove_observations(self, observations: Array) -> None:
+        """Marks observation indices as outliers; a landmark left with fewer than two loses its point."""
+        observations = observations[self.obs_valid[observations]]
+        self.obs_valid[observations] = False
+        ids = self.obs_landmark[observations]
+        np.subtract.at(self._count.view, ids, 1)
+        self.remove_landmarks(np.unique(ids[self.num_observations[ids] < 2]))
+
+    def remove_landmarks(self, ids: Array) -> None:
+        """Takes the points of landmarks away; a track that lives on starts afresh at its next keyframe.
+
+        Observations before `first_observation` count no more, so the old ones need not be looked for.
+        """
+        self._points.view[ids] = np.nan
+        self._first.view[ids] = -1
+        self._count.view[ids] = 0
+
+    def clone_pose(self, keyframe: int) -> Array:
+        """T_cam_world (4, 4) of a keyframe, a copy."""
+        return np.array(self._poses.view[keyframe])
+
