@@ -31,7 +31,7 @@ def log_so3(rotation: Array) -> Array:
     n = float(np.linalg.norm(v))
     if n < 1e-9:
         return np.asarray(2.0 * v / w)
-    return np.asarray(2.0 * float(np.arctan2(n, w)) / n * v
+    return np.asarray(2.0 * float(np.arctan2(n, w)) / n * v)
 
 
 def exp_se3(xi: Array) -> Array:

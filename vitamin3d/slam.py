@@ -1,0 +1,242 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Tracking, localisation and mapping on one page (Fig. 2a–b of the paper): `Slam.process_frame`, top to bottom."""
+
+import time
+from collections.abc import Iterator
+from contextlib import contextmanager
+
+import numpy as np
+
+from vitamin3d.config import Config
+from vitamin3d.geometry.camera import Camera
+from vitamin3d.geometry.se3 import inverse
+from vitamin3d.mapping.initialization_history import InitializationHistory, TrackedView
+from vitamin3d.mapping.keyframe_selection import is_keyframe
+from vitamin3d.mapping.landmark_recovery import recover_landmarks
+from vitamin3d.mapping.landmark_statistics import keyframe_vertices
+from vitamin3d.mapping.landmark_triangulation import triangulate_landmarks
+from vitamin3d.mapping.map_initialization import add_view, build_first_map
+from vitamin3d.mapping.p3p_localization import localize
+from vitamin3d.mapping.pose_log import PoseLog
+from vitamin3d.mapping.sparse_map import SparseMap
+from vitamin3d.mapping.subspace_bundle_adjustment import adjust_bundle, adjust_subspace, squared_reprojection_errors
+from vitamin3d.mapping.two_view_initialization import initialize_from_two_views
+from vitamin3d.mapping.window_selection import BundleProblem, Window, build_problem, select_window, store_solution
+from vitamin3d.tracking.extrema import refine_extrema, select_free_extrema
+from vitamin3d.tracking.extrema_tracking import predict_by_dense_flow, predict_by_dominant_flow, track_extrema
+from vitamin3d.types import Array, Frame, FrontEndFrame, MapSnapshot, SlamState, StepTimes, Tracks, Trajectory
+
+
+class Slam:
+    """Tracks the extrema of a monocular sequence and maps them (Sec. 2 and 3 of the paper)."""
+
+    def __init__(self, camera: Camera, config: Config) -> None:
+        self.camera, self.config = camera, config
+        self.state = SlamState.INITIALIZING
+        self.tracks = Tracks.empty()
+        self.map = SparseMap()
+        self.poses = PoseLog()
+        self.times = StepTimes()
+        self.initialization_reason, self.initialization_retries = "no frame was read", 0
+        self._history = InitializationHistory(config.initialization)
+        self._pending_frames: dict[int, Frame] = {}
+        self._next_id = 0
+        self._frame_count = 0
+
+    def process_frame(self, front: FrontEndFrame) -> SlamState:
+        """One frame, from its curvature and flow to an adjusted map."""
+        with self._timed("track_extrema"):
+            self.tracks = self._track(front)
+        if self.state is SlamState.INITIALIZING:
+            with self._timed("initialize"):
+                self._initialize(front)
+        else:
+            with self._timed("localize"):
+                T_cam_world = self._localize(front)
+            if T_cam_world is not None:
+                with self._timed("map"):
+                    self._map(front, T_cam_world)
+        if self._frame_count % self.config.extrema.refill_interval == 0:
+            with self._timed("refill"):
+                self._refill(front)
+        self._frame_count += 1
+        return self.state
+
+    # --- tracking (Sec. 2) -------------------------------------------------------------------------------------
+
+    def _track(self, front: FrontEndFrame) -> Tracks:
+        """Predict (Eq. 4) and climb (Eq. 5)."""
+        if front.dense_flow is not None:
+            predicted = predict_by_dense_flow(self.tracks.pixels, front.dense_flow)
+        else:
+            predicted = predict_by_dominant_flow(self.tracks.pixels, front.dominant_flow)
+        return track_extrema(self.tracks, predicted, front.kappa, self.config.extrema_tracking)
+
+    def _refill(self, front: FrontEndFrame) -> None:
+        """Free extrema become tracks."""
+        new = select_free_extrema(front.extrema, self.tracks.pixels, front.kappa.shape, self.config.extrema)
+        ids, zeros = np.arange(self._next_id, self._next_id + len(new)), np.zeros(len(new), np.int32)
+        self._next_id += len(new)
+        kappa = front.kappa[new[:, 1], new[:, 0]]
+        self.tracks = Tracks.concatenate(self.tracks, Tracks(ids, refine_extrema(front.kappa, new), kappa, zeros, zeros))
+
+    def _seen(self) -> tuple[Tracks, Array]:
+        """The tracks that do not coast, and their ideal pixels."""
+        seen = self.tracks.select(self.tracks.missed == 0)
+        pixels = self.camera.undistort(seen.pixels)
+        valid = np.isfinite(pixels[:, 0])
+        return seen.select(valid), pixels[valid]
+
+    # --- initialisation and localisation (Sec. 5.1) ------------------------------------------------------------
+
+    def _initialize(self, front: FrontEndFrame) -> None:
+        """The first map from two frames; the frames before it are localised against it."""
+        self._history.append(TrackedView(front.frame, *self._seen()))
+        ids, pixels_0, pixels_1 = self._history.pair()
+        if not self._history.is_worth_a_try(pixels_0, pixels_1):
+            return
+        attempt = initialize_from_two_views(pixels_0, pixels_1, self.camera, self.config.initialization)
+        first = build_first_map(attempt.view, ids, self._history.since_reference(), self.camera, self.config) if attempt.view else None
+        if first is None:
+            self.initialization_reason = attempt.reason or "the first map did not survive its bundle adjustment"
+            self.initialization_retries += attempt.is_retry or attempt.view is not None
+            return
+        self.map, self.state, self.initialization_reason = first.map, SlamState.TRACKING, ""
+        self._pending_frames = {k: view.frame for k, view in enumerate(first.keyframe_views)}
+        self._log_history()
+        self._history.views.clear()
+
+    def _log_history(self) -> None:
+        """Localises the frames from before the map against it: their tracks were kept."""
+        keyframe_of_frame = {index: k for k, index in enumerate(self.map.frame_indices)}
+        for view in self._history.views:
+            k = keyframe_of_frame.get(view.frame.index)
+            if k is not None:
+                self.poses.add(view.frame, k, np.eye(4), self.map)
+                continue
+            mapped = self.map.is_mapped(view.tracks.ids)
+            points = self.map.points_world[view.tracks.ids[mapped]]
+            found = localize(points, view.ideal_pixels[mapped], None, self.camera, self.config.localization, self.config.seed)
+            if found.converged:
+                self.poses.add_world(view.frame, found.T_cam_world, self.map)
+
+    def _localize(self, front: FrontEndFrame) -> Array | None:
+        """T_cam_world of the frame by P3P RANSAC and refinement; ends the tracks that disagree with it."""
+        seen, pixels = self._seen()
+        mapped = self.map.is_mapped(seen.ids)
+        ids, seed = seen.ids[mapped], self.config.seed + front.frame.index
+        prior = self.poses.predict(self.map)
+        found = localize(self.map.points_world[ids], pixels[mapped], prior, self.camera, self.config.localization, seed)
+        if not found.converged:
+            self.state = SlamState.LOST
+            self._recover(front, prior)
+            return None
+        self.state = SlamState.TRACKING
+        self.tracks = self.tracks.select(~np.isin(self.tracks.ids, ids[~found.is_inlier]))
+        return found.T_cam_world
+
+    def _recover(self, front: FrontEndFrame, T_cam_world: Array) -> int:
+        """Takes up landmarks that came back into view; how many."""
+        before = self.tracks.ids
+        image, recovery = front.frame.image, self.config.recovery
+        self.tracks = recover_landmarks(self.tracks, self.map, image, front.kappa, T_cam_world, self.camera, recovery)
+        return int((~np.isin(self.tracks.ids, before)).sum())
+
+    # --- mapping (Sec. 3) --------------------------------------------------------------------------------------
+
+    def _map(self, front: FrontEndFrame, T_cam_world: Array) -> None:
+        """Recovery, keyframes, landmarks, and bundle adjustment on every frame (Eq. 11–12)."""
+        recovery = self.config.recovery
+        if recovery.enabled and self._frame_count % recovery.interval == 0 and self._recover(front, T_cam_world):
+            T_cam_world = self._relocalize(T_cam_world)
+        if self._is_keyframe(front.frame):
+            keyframe = self._add_keyframe(front, T_cam_world)
+            triangulate_landmarks(self.map, self.camera, self.config.triangulation)
+            self._adjust_window()
+            self.poses.add(front.frame, keyframe, np.eye(4), self.map)
+        else:
+            T_cam_world = self._adjust_with_frame(T_cam_world)
+            self.poses.add_world(front.frame, T_cam_world, self.map)
+
+    def _relocalize(self, T_cam_world: Array) -> Array:
+        """The pose refined with the landmarks that were found again."""
+        seen, pixels = self._seen()
+        mapped = self.map.is_mapped(seen.ids)
+        ids = seen.ids[mapped]
+        found = localize(self.map.points_world[ids], pixels[mapped], T_cam_world, self.camera, self.config.localization)
+        if not found.converged:
+            return T_cam_world
+        self.tracks = self.tracks.select(~np.isin(self.tracks.ids, ids[~found.is_inlier]))
+        return found.T_cam_world
+
+    def _is_keyframe(self, frame: Frame) -> bool:
+        seen, pixels = self._seen()
+        last = self.map.num_keyframes - 1
+        rows = self.map.observations_of(last)
+        ids = self.map.obs_landmark[rows]
+        mapped = np.flatnonzero(self.map.is_mapped(ids) & self.map.obs_valid[rows])
+        _, a, b = np.intersect1d(ids[mapped], seen.ids, assume_unique=True, return_indices=True)
+        gap = frame.index - self.map.frame_indices[last]
+        return is_keyframe(self.map.obs_pixels[rows][mapped[a]], pixels[b], len(mapped), gap, self.config.keyframes)
+
+    def _add_keyframe(self, front: FrontEndFrame, T_cam_world: Array) -> int:
+        keyframe = add_view(self.map, TrackedView(front.frame, *self._seen()), T_cam_world)
+        self._pending_frames[keyframe] = front.frame
+        return keyframe
+
+    def _adjust_window(self) -> None:
+        """The keyframe's adjustment of the window and its landmarks, anchored; outliers leave the map and the tracks."""
+        with self._timed("bundle_adjustment_keyframe"):
+            window = select_window(self.map, self.config.window)
+            solved, _ = adjust_bundle(build_problem(self.map, window), self.camera, self.config.bundle_adjustment)
+            store_solution(self.map, window, solved)
+            self._remove_outliers(window, solved)
+
+    def _remove_outliers(self, window: Window, solved: BundleProblem) -> None:
+        limit = self.config.bundle_adjustment.outlier_px**2
+        is_outlier = squared_reprojection_errors(solved, self.camera) > limit
+        is_newest = solved.obs_camera == window.num_adjusted - 1
+        self.map.remove_observations(solved.obs_rows[is_outlier])
+        ended = solved.landmark_ids[solved.obs_point[is_outlier & is_newest]]
+        self.tracks = self.tracks.select(~np.isin(self.tracks.ids, ended))
+
+    def _adjust_with_frame(self, T_cam_world: Array) -> Array:
+        """A few sweeps of subspace Gauss–Newton over the window and the newest frame; the frame's pose."""
+        adjustment = self.config.bundle_adjustment
+        if adjustment.sweeps_per_frame == 0:
+            return T_cam_world
+        with self._timed("bundle_adjustment_frame"):
+            seen, pixels = self._seen()
+            mapped = self.map.is_mapped(seen.ids)
+            window = select_window(self.map, self.config.window)
+            problem = build_problem(self.map, window, (T_cam_world, seen.ids[mapped], pixels[mapped]))
+            solved, _ = adjust_subspace(problem, self.camera, adjustment.sigma_px, adjustment.sweeps_per_frame)
+            store_solution(self.map, window, solved)
+        return np.asarray(solved.T_cam_world[-1])
+
+    # --- what leaves ---------------------------------------------------------------------------------------------
+
+    def take_snapshots(self, everything: bool = False) -> list[MapSnapshot]:
+        """The keyframes that left the window since the last call (or all that remain), each once, for the dense half."""
+        settled = self.map.num_keyframes - (0 if everything else self.config.window.keyframes)
+        ready = sorted(k for k in self._pending_frames if k < settled)
+        return [self.snapshot(k, self._pending_frames.pop(k)) for k in ready]
+
+    def snapshot(self, keyframe: int, frame: Frame) -> MapSnapshot:
+        """A keyframe with the depths of its landmarks as the map has them now."""
+        vertices = keyframe_vertices(self.map, keyframe, self.camera, self.config.snapshot)
+        return MapSnapshot(frame, self.map.clone_pose(keyframe), *vertices)
+
+    def trajectory(self) -> Trajectory:
+        """Camera-to-world poses of all localised frames."""
+        return self.poses.trajectory(self.map)
+
+    def keyframe_trajectory(self) -> Trajectory:
+        """Camera-to-world poses of the keyframes."""
+        return Trajectory(np.array(self.map.timestamps_ns, np.int64), inverse(self.map.T_cam_world))
+
+    @contextmanager
+    def _timed(self, step: str) -> Iterator[None]:
+        start = time.perf_counter()
+        yield
+        self.times.add(step, time.perf_counter() - start)
