@@ -179,7 +179,7 @@ class NltgvConfig:
 
     enabled: bool = True
     iterations: int = 400
-    data_weight: float = 1.0
+    data_weight: float = 2.0
     """lambda."""
     slope_weight: float = 1.0
     """beta."""

@@ -1,0 +1,153 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Depth views -> a truncated signed distance field -> a mesh (Sec. 4.2, "Mesh Integration in TSDF"; Curless and Levoy 1996)."""
+
+from functools import cache
+from typing import Any, Protocol
+
+import numpy as np
+
+from vitamin3d.errors import DependencyError, InputError
+from vitamin3d.geometry.camera import Camera
+from vitamin3d.types import Array, DepthView, Surface
+
+BLOCK_RESOLUTION = 16
+"""Voxels along the side of a block; both backends allocate by blocks."""
+
+
+class TsdfVolume:
+    """A volume that depth views are averaged into; coarse and fine are two instances.
+
+    Args:
+        voxel_length: map units.
+        truncation: map units; distances are kept up to this far from a surface.
+        backend: `scalable` (Open3D's ScalableTSDFVolume) or `voxel_block_grid` (its tensor twin).
+
+    Raises:
+        InputError: no such backend.
+        DependencyError: the installed Open3D fuses nothing.
+    """
+
+    def __init__(self, voxel_length: float, truncation: float, backend: str = "scalable") -> None:
+        if backend not in BACKENDS:
+            raise InputError(f"fusion.backend must be one of {', '.join(BACKENDS)}, not {backend!r}")
+        check_backend(backend)
+        self.voxel_length = voxel_length
+        self._volume = BACKENDS[backend](voxel_length, truncation)
+
+    def integrate(self, view: DepthView, canvas: Camera, max_depth: float) -> None:
+        """Averages a view, drawn on `canvas`, into the volume; depths beyond `max_depth` (map units) are left out."""
+        self._volume.integrate(view, canvas, max_depth)
+
+    def extract_surface(self) -> Surface:
+        """The zero level (marching cubes), triangles facing the cameras; vertex normals are not filled in yet (zero)."""
+        return self._volume.extract_surface()
+
+
+class _Backend(Protocol):
+    def __init__(self, voxel_length: float, truncation: float) -> None: ...
+
+    def integrate(self, view: DepthView, canvas: Camera, max_depth: float) -> None: ...
+
+    def extract_surface(self) -> Surface: ...
+
+
+class _ScalableVolume:
+    """Open3D's ScalableTSDFVolume."""
+
+    def __init__(self, voxel_length: float, truncation: float) -> None:
+        import open3d as o3d
+
+        self._volume = o3d.pipelines.integration.ScalableTSDFVolume(
+            voxel_length=voxel_length,
+            sdf_trunc=truncation,
+            color_type=o3d.pipelines.integration.TSDFVolumeColorType.RGB8,
+            volume_unit_resolution=BLOCK_RESOLUTION,
+            depth_sampling_stride=4,
+        )
+
+    def integrate(self, view: DepthView, canvas: Camera, max_depth: float) -> None:
+        import open3d as o3d
+
+        rgbd = o3d.geometry.RGBDImage.create_from_color_and_depth(
+            o3d.geometry.Image(np.ascontiguousarray(view.color)),
+            o3d.geometry.Image(np.ascontiguousarray(view.depth, np.float32)),
+            depth_scale=1.0,
+            depth_trunc=max_depth,
+            convert_rgb_to_intensity=False,
+        )
+        pinhole = o3d.camera.PinholeCameraIntrinsic(canvas.width, canvas.height, canvas.fx, canvas.fy, canvas.cx, canvas.cy)
+        self._volume.integrate(rgbd, pinhole, view.T_cam_world)
+
+    def extract_surface(self) -> Surface:
+        mesh = self._volume.extract_triangle_mesh()
+        return _surface(np.asarray(mesh.vertices), np.asarray(mesh.triangles), np.asarray(mesh.vertex_colors))
+
+
+class _VoxelBlockGrid:
+    """Open3D's tensor VoxelBlockGrid on the CPU (its `ray_cast` crashes at random and is never called)."""
+
+    def __init__(self, voxel_length: float, truncation: float) -> None:
+        import open3d as o3d
+
+        self._truncation_voxels = truncation / voxel_length
+        self._grid = o3d.t.geometry.VoxelBlockGrid(
+            attr_names=("tsdf", "weight", "color"),
+            attr_dtypes=(o3d.core.float32, o3d.core.float32, o3d.core.float32),
+            attr_channels=((1), (1), (3)),
+            voxel_size=voxel_length,
+            block_resolution=BLOCK_RESOLUTION,
+            block_count=4000,
+            device=o3d.core.Device("CPU:0"),
+        )
+
+    def integrate(self, view: DepthView, canvas: Camera, max_depth: float) -> None:
+        import open3d as o3d
+
+        depth = o3d.t.geometry.Image(o3d.core.Tensor(np.ascontiguousarray(view.depth, np.float32)))
+        color = o3d.t.geometry.Image(o3d.core.Tensor(view.color.astype(np.float32) / 255.0))
+        K, T = o3d.core.Tensor(canvas.K), o3d.core.Tensor(np.ascontiguousarray(view.T_cam_world, np.float64))
+        scales = (1.0, max_depth, self._truncation_voxels)
+        blocks = self._grid.compute_unique_block_coordinates(depth, K, T, *scales)
+        self._grid.integrate(blocks, depth, color, K, K, T, *scales)
+
+    def extract_surface(self) -> Surface:
+        mesh = self._grid.extract_triangle_mesh(weight_threshold=0.5)
+        if not len(mesh.vertex.positions):
+            return empty_surface()
+        return _surface(mesh.vertex.positions.numpy(), mesh.triangle.indices.numpy(), mesh.vertex.colors.numpy())
+
+
+BACKENDS: dict[str, type[_Backend]] = {"scalable": _ScalableVolume, "voxel_block_grid": _VoxelBlockGrid}
+
+
+def empty_surface() -> Surface:
+    """A surface of nothing."""
+    return _surface(np.zeros((0, 3)), np.zeros((0, 3), np.int32), np.zeros((0, 3)))
+
+
+def _surface(vertices: Any, triangles: Any, colors: Any) -> Surface:
+    """Our type from Open3D's arrays: colours in 0–1, no normals yet."""
+    vertices = np.array(vertices, np.float64)
+    bytes_rgb = np.rint(255.0 * np.clip(np.asarray(colors, np.float64), 0.0, 1.0)).astype(np.uint8)
+    return Surface(vertices, np.array(triangles, np.int32), np.zeros_like(vertices), bytes_rgb)
+
+
+@cache
+def check_backend(backend: str) -> None:
+    """Fuses a small plane, once per process: Open3D 0.20's ScalableTSDFVolume allocates nothing and says nothing.
+
+    Raises:
+        DependencyError: the plane does not come back.
+    """
+    canvas = Camera(40.0, 40.0, 19.5, 19.5, 40, 40)
+    depth, normals, color = np.ones((40, 40), np.float32), np.zeros((40, 40, 3), np.float32), np.full((40, 40, 3), 128, np.uint8)
+    volume = BACKENDS[backend](0.04, 0.16)
+    volume.integrate(DepthView(0, np.eye(4), depth, normals, color), canvas, 2.0)
+    if not _is_plane_at_one(volume.extract_surface().vertices_world):
+        import open3d as o3d
+
+        raise DependencyError(f"Open3D {o3d.__version__} ({backend}) fuses nothing; install 0.19 (`pip install 'open3d<0.20'`)")
+
+
+def _is_plane_at_one(points: Array) -> bool:
+    return len(points) > 20 and float(np.abs(points[:, 2] - 1.0).max()) < 0.02

@@ -1,0 +1,150 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Surfaces and clouds as PLY (binary) and OBJ (text), each file complete or absent."""
+
+import os
+from collections.abc import Iterable, Iterator
+from pathlib import Path
+
+import numpy as np
+
+from vitamin3d.errors import InputError, OutputError
+from vitamin3d.types import Array, PointCloud, Surface
+
+POSITION, NORMAL, COLOR = ("x", "y", "z"), ("nx", "ny", "nz"), ("red", "green", "blue")
+VERTEX = np.dtype([(n, "<f4") for n in POSITION + NORMAL] + [(n, "u1") for n in COLOR])
+FACE = np.dtype([("count", "u1"), ("vertex_indices", "<i4", (3,))])
+CLOUD = np.dtype(
+    [(n, "<f4") for n in POSITION]
+    + [(n, "u1") for n in COLOR]
+    + [("num_observations", "<i4")]
+    + [(n, "<f4") for n in ("parallax_deg", "reprojection_rms_px", "depth_deviation")]
+)
+PLY_NAMES = {"<f4": "float", "|u1": "uchar", "<i4": "int"}
+CHUNK_LINES = 20_000
+
+
+def write_ply(surface: Surface, path: Path, comments: list[str]) -> None:
+    """Binary little-endian PLY with vertex normals, colours and triangles.
+
+    Args:
+        comments: each becomes a `comment` line of the header.
+
+    Raises:
+        OutputError: the file cannot be written.
+    """
+    vertices = np.empty(len(surface.vertices_world), VERTEX)
+    _fill(vertices, POSITION, surface.vertices_world)
+    _fill(vertices, NORMAL, surface.normals_world)
+    _fill(vertices, COLOR, surface.colors)
+    faces = np.empty(len(surface.triangles), FACE)
+    faces["count"] = 3
+    faces["vertex_indices"] = surface.triangles
+    write_file(path, [_header(vertices, comments, _face_lines(len(faces))), vertices.tobytes(), faces.tobytes()])
+
+
+def write_cloud_ply(cloud: PointCloud, path: Path, comments: list[str]) -> None:
+    """Binary little-endian PLY of the points with their colours and quality, one property each.
+
+    Raises:
+        OutputError: the file cannot be written.
+    """
+    points = np.empty(len(cloud.points_world), CLOUD)
+    _fill(points, POSITION, cloud.points_world)
+    _fill(points, COLOR, cloud.colors)
+    for name in ("num_observations", "parallax_deg", "reprojection_rms_px", "depth_deviation"):
+        points[name] = getattr(cloud, name)
+    write_file(path, [_header(points, comments, []), points.tobytes()])
+
+
+def write_obj(surface: Surface, path: Path, comments: list[str]) -> None:
+    """Text OBJ with vertex colours (`v x y z r g b`, as MeshLab and Blender read them) and normals.
+
+    Raises:
+        OutputError: the file cannot be written.
+    """
+    write_file(path, (text.encode() for text in _obj_text(surface, comments)))
+
+
+def read_ply(path: Path) -> Surface:
+    """A surface that `write_ply` wrote.
+
+    Raises:
+        InputError: the file cannot be read, or is another kind of PLY.
+    """
+    try:
+        data = path.read_bytes()
+    except OSError as error:
+        raise InputError(f"{path}: cannot be read ({error.strerror})") from None
+    header, _, body = data.partition(b"end_header\n")
+    lines = header.decode("ascii", "replace").splitlines()
+    num_vertices, num_faces = _element_count(lines, "vertex"), _element_count(lines, "face")
+    expected = _header(np.empty(num_vertices, VERTEX), [], _face_lines(num_faces)).decode().splitlines()[:-1]
+    size = num_vertices * VERTEX.itemsize
+    if [line for line in lines if not line.startswith("comment ")] != expected or len(body) != size + num_faces * FACE.itemsize:
+        raise InputError(f"{path}: not a mesh that vitamin3d wrote, or cut short; write it again")
+    vertices, faces = np.frombuffer(body[:size], VERTEX), np.frombuffer(body[size:], FACE)
+    points, normals, colors = (np.stack([vertices[n] for n in names], axis=1) for names in (POSITION, NORMAL, COLOR))
+    return Surface(points.astype(np.float64), faces["vertex_indices"].astype(np.int32), normals.astype(np.float64), colors)
+
+
+def _element_count(lines: list[str], name: str) -> int:
+    """Number of elements that a header declares; 0 where it declares none."""
+    words = next((line.split() for line in lines if line.startswith(f"element {name} ")), [])
+    return int(words[2]) if len(words) == 3 and words[2].isdigit() else 0
+
+
+def write_file(path: Path, parts: Iterable[bytes]) -> None:
+    """Writes the parts to a temporary name in the same folder, then renames: `path` is complete or as it was.
+
+    Raises:
+        OutputError: the disk is full, or the folder is missing or not writable.
+    """
+    temporary = path.with_name(f".{path.name}.{os.getpid()}.tmp")
+    try:
+        with temporary.open("wb") as file:
+            for part in parts:
+                file.write(part)
+        temporary.replace(path)
+    except OSError as error:
+        raise OutputError(f"{path}: cannot be written ({error.strerror}); free the disk or choose another --out") from None
+    finally:
+        _remove(temporary)
+
+
+def _remove(temporary: Path) -> None:
+    try:
+        temporary.unlink(missing_ok=True)
+    except OSError:
+        return  # the folder itself is out of reach: nothing was written
+
+
+def _fill(table: Array, names: tuple[str, ...], columns: Array) -> None:
+    for k, name in enumerate(names):
+        table[name] = columns[:, k]
+
+
+def _face_lines(count: int) -> list[str]:
+    return [f"element face {count}", "property list uchar int vertex_indices"]
+
+
+def _header(vertices: Array, comments: list[str], face_lines: list[str]) -> bytes:
+    fields = vertices.dtype.fields or {}
+    lines = ["ply", "format binary_little_endian 1.0"]
+    lines += [f"comment {line}" for comment in comments for line in comment.splitlines()]
+    lines += [f"element vertex {len(vertices)}"]
+    lines += [f"property {PLY_NAMES[kind[0].str]} {name}" for name, kind in fields.items()]
+    return "\n".join([*lines, *face_lines, "end_header\n"]).encode("ascii", "replace")
+
+
+def _obj_text(surface: Surface, comments: list[str]) -> Iterator[str]:
+    yield "".join(f"# {line}\n" for comment in comments for line in comment.splitlines())
+    yield from _lines("v %.6g %.6g %.6g %.4g %.4g %.4g\n", np.hstack([surface.vertices_world, surface.colors / 255.0]))
+    yield from _lines("vn %.4g %.4g %.4g\n", surface.normals_world)
+    yield from _lines("f %d//%d %d//%d %d//%d\n", np.repeat(surface.triangles + 1, 2, axis=1))
+
+
+def _lines(pattern: str, rows: Array) -> Iterator[str]:
+    """The rows (N, C) through a % pattern, in chunks: one formatting call each, many times faster than `savetxt`."""
+    for start in range(0, len(rows), CHUNK_LINES):
+        chunk = rows[start : start + CHUNK_LINES]
+        yield (pattern * len(chunk)) % tuple(chunk.ravel().tolist())

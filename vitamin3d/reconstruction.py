@@ -1,0 +1,88 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The dense half of VITAMIN-E (Sec. 4.2): keyframes with landmark depths -> meshes in the image -> TSDF -> surface."""
+
+import time
+from collections.abc import Iterator
+from contextlib import contextmanager
+
+import numpy as np
+
+from vitamin3d.config import Config
+from vitamin3d.dense.delaunay import triangulate
+from vitamin3d.dense.depth_rendering import DepthRenderer
+from vitamin3d.dense.nltgv import denoise
+from vitamin3d.dense.surface_extraction import clean
+from vitamin3d.dense.tsdf_fusion import TsdfVolume, empty_surface
+from vitamin3d.geometry.camera import Camera
+from vitamin3d.types import DepthView, MapSnapshot, StepTimes, Surface
+
+
+class Reconstruction:
+    """Turns keyframes into a coarse and a fine surface.
+
+    Args:
+        camera: of the snapshots' frames.
+        config: its dense groups are used.
+        times: grows by the milliseconds of each step.
+    """
+
+    def __init__(self, camera: Camera, config: Config, times: StepTimes | None = None) -> None:
+        self.config = config
+        self.times = times if times is not None else StepTimes()
+        self.renderer = DepthRenderer(camera, config.depth_rendering)
+        self.median_depths: list[float] = []
+        self.low: TsdfVolume | None = None
+        self.high: TsdfVolume | None = None
+
+    @property
+    def canvas(self) -> Camera:
+        """The undistorted camera of the depth views."""
+        return self.renderer.canvas
+
+    def add_keyframe(self, snapshot: MapSnapshot) -> DepthView | None:
+        """Meshes, denoises, renders and fuses a keyframe; None where it has too few landmarks."""
+        with self._timed("meshing"):
+            mesh = triangulate(snapshot, self.config.delaunay)
+        if mesh is None:
+            return None
+        with self._timed("denoising"):
+            denoised = denoise(mesh, self.config.nltgv)
+        with self._timed("rendering"):
+            view = self.renderer.render(snapshot, denoised.mesh, denoised.slopes)
+        self.median_depths.append(float(np.median(1.0 / mesh.inverse_depth)))
+        self._fuse(view)
+        return view
+
+    def surfaces(self) -> tuple[Surface, Surface]:
+        """The coarse and the fine surface of all keyframes so far."""
+        with self._timed("surface_low"):
+            low = self._surface(self.low)
+        with self._timed("surface_high"):
+            high = self._surface(self.high)
+        return low, high
+
+    def voxel_lengths(self) -> tuple[float, float]:
+        """Sides of the coarse and the fine voxels in map units: as configured, or fractions of the first keyframe's median depth."""
+        fusion, depth = self.config.fusion, self.median_depths[0]
+        return fusion.voxel_low or depth / fusion.depth_per_voxel_low, fusion.voxel_high or depth / fusion.depth_per_voxel_high
+
+    def _fuse(self, view: DepthView) -> None:
+        if self.low is None or self.high is None:
+            self.low, self.high = (self._volume(length) for length in self.voxel_lengths())
+        max_depth = self.config.fusion.max_depth * float(np.median(self.median_depths))
+        with self._timed("fusion_low"):
+            self.low.integrate(view, self.canvas, max_depth)
+        with self._timed("fusion_high"):
+            self.high.integrate(view, self.canvas, max_depth)
+
+    def _volume(self, voxel_length: float) -> TsdfVolume:
+        return TsdfVolume(voxel_length, self.config.fusion.truncation_voxels * voxel_length, self.config.fusion.backend)
+
+    def _surface(self, volume: TsdfVolume | None) -> Surface:
+        return clean(volume.extract_surface(), self.config.surface) if volume else empty_surface()
+
+    @contextmanager
+    def _timed(self, step: str) -> Iterator[None]:
+        start = time.perf_counter()
+        yield
+        self.times.add(step, time.perf_counter() - start)
