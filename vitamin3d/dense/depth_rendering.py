@@ -121,4 +121,4 @@ def normals_from_slopes(layers: Array, canvas: Camera) -> Array:
     nz = layers[..., 0] - nx * x - ny * y[:, None]
     normals = -np.stack([nx, ny, nz], axis=-1)
     normals[layers[..., 0] <= 0] = 0.0
-    return (normals / np.maximum(np.linalg.norm(normals, axis=-1, keepdims=True), 1e-300)).astype(np.float32)
+    return np.asarray(normals / np.maximum(np.linalg.norm(normals, axis=-1, keepdims=True), 1e-300), np.float32)

@@ -128,11 +128,11 @@ def _face_lines(count: int) -> list[str]:
 
 
 def _header(vertices: Array, comments: list[str], face_lines: list[str]) -> bytes:
-    fields = vertices.dtype.fields or {}
+    columns = [(name, PLY_NAMES[vertices.dtype[name].str]) for name in vertices.dtype.names or ()]
     lines = ["ply", "format binary_little_endian 1.0"]
     lines += [f"comment {line}" for comment in comments for line in comment.splitlines()]
     lines += [f"element vertex {len(vertices)}"]
-    lines += [f"property {PLY_NAMES[kind[0].str]} {name}" for name, kind in fields.items()]
+    lines += [f"property {kind} {name}" for name, kind in columns]
     return "\n".join([*lines, *face_lines, "end_header\n"]).encode("ascii", "replace")
 
 

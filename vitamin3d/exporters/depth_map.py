@@ -1,0 +1,56 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Depth maps as 16-bit PNG, and the one way that PNGs are written."""
+
+from pathlib import Path
+
+import cv2
+import numpy as np
+
+from vitamin3d.errors import InputError, OutputError
+from vitamin3d.exporters.mesh import write_file
+from vitamin3d.types import Array
+
+MAX_COUNT = 65535
+
+
+def write_depth_map(depth: Array, path: Path, counts_per_unit: float) -> None:
+    """Depth (H, W) in map units as 16-bit PNG: count = depth * `counts_per_unit`; 0 = none or too far for 16 bits.
+
+    Raises:
+        OutputError: the file cannot be written.
+    """
+    write_png(counts_from_depth(depth, counts_per_unit), path)
+
+
+def read_depth_map(path: Path, counts_per_unit: float) -> Array:
+    """Depth (H, W) float32 in map units, 0 = none, of a file of `write_depth_map`.
+
+    Raises:
+        InputError: not a 16-bit PNG.
+    """
+    try:
+        counts = cv2.imdecode(np.frombuffer(path.read_bytes(), np.uint8), cv2.IMREAD_UNCHANGED)
+    except (OSError, cv2.error):
+        counts = None
+    if counts is None or counts.dtype != np.uint16 or counts.ndim != 2:
+        raise InputError(f"{path}: not a depth map (16-bit grey PNG) that vitamin3d wrote")
+    return np.asarray(counts.astype(np.float32) / np.float32(counts_per_unit))
+
+
+def counts_from_depth(depth: Array, counts_per_unit: float) -> Array:
+    """(H, W) uint16, rounded; what does not fit, NaN and below zero become 0."""
+    counts = np.rint(np.nan_to_num(np.asarray(depth, np.float64), nan=0.0, posinf=0.0, neginf=0.0) * counts_per_unit)
+    return np.where((counts >= 0) & (counts <= MAX_COUNT), counts, 0).astype(np.uint16)
+
+
+def write_png(image: Array, path: Path) -> None:
+    """An image (H, W) uint8 or uint16, or (H, W, 3) uint8 RGB, complete or not at all.
+
+    Raises:
+        OutputError: the file cannot be written.
+    """
+    ordered = cv2.cvtColor(image, cv2.COLOR_RGB2BGR) if image.ndim == 3 else image
+    ok, buffer = cv2.imencode(".png", ordered)
+    if not ok:
+        raise OutputError(f"{path}: OpenCV could not encode the image {image.shape} {image.dtype} as PNG")
+    write_file(path, [buffer.tobytes()])

@@ -1,0 +1,89 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Normal maps: of a keyframe's depth view, or cast from a mesh (the paper's Fig. 3d)."""
+
+from pathlib import Path
+
+import numpy as np
+
+from vitamin3d.exporters.depth_map import write_png
+from vitamin3d.geometry.camera import Camera
+from vitamin3d.types import Array, Surface
+
+RED_GREEN_BLUE = np.array([1.0, -1.0, -1.0])
+"""Camera right -> red, up -> green, towards the camera -> blue: a wall that faces the camera is light violet."""
+
+
+def write_normal_map(normals: Array, path: Path, R_frame_cam: Array | None = None) -> None:
+    """Unit normals (H, W, 3) in the camera frame as an 8-bit RGB PNG.
+
+    Args:
+        normals: 0 where there is none, which becomes black.
+        R_frame_cam: (3, 3) rotation into another frame (the world, say), whose x, y, z become red, green and blue;
+            None: the camera's right, up and backwards do.
+
+    Raises:
+        OutputError: the file cannot be written.
+    """
+    write_png(rgb_from_normals(normals, R_frame_cam), path)
+
+
+def rgb_from_normals(normals: Array, R_frame_cam: Array | None = None) -> Array:
+    """(H, W, 3) uint8 RGB `(n + 1) / 2` of normals (H, W, 3), 0 where there is none; see `write_normal_map`."""
+    turned = normals * RED_GREEN_BLUE if R_frame_cam is None else normals @ R_frame_cam.T
+    rgb = np.rint(127.5 * (np.clip(turned, -1.0, 1.0) + 1.0)).astype(np.uint8)
+    rgb[~(normals != 0).any(axis=-1)] = 0
+    return np.asarray(rgb)
+
+
+def cast_normal_map(surface: Surface, camera: Camera, T_cam_world: Array) -> Array:
+    """Normals (H, W, 3) float32 in the camera frame, towards the camera, of the mesh as a pinhole camera sees it; 0 = none.
+
+    The camera's distortion is not used: give the canvas. To cast many maps of one mesh, keep a `NormalCaster`.
+    """
+    return NormalCaster(surface).cast(camera, T_cam_world)
+
+
+class NormalCaster:
+    """A mesh ready for casting (Open3D's RaycastingScene); the vertex normals are interpolated."""
+
+    def __init__(self, surface: Surface) -> None:
+        import open3d as o3d
+
+        self._surface = surface
+        self._scene = o3d.t.geometry.RaycastingScene()
+        self._scene.add_triangles(
+            o3d.core.Tensor(surface.vertices_world.astype(np.float32)), o3d.core.Tensor(surface.triangles.astype(np.uint32))
+        )
+
+    def cast(self, camera: Camera, T_cam_world: Array) -> Array:
+        """Normals (H, W, 3) float32; see `cast_normal_map`."""
+        import open3d as o3d
+
+        hits = self._scene.cast_rays(o3d.core.Tensor(_rays_world(camera, T_cam_world)))
+        hit = np.isfinite(hits["t_hit"].numpy())
+        normals = np.zeros((camera.height, camera.width, 3), np.float32)
+        corners = self._surface.triangles[hits["primitive_ids"].numpy()[hit]]
+        seen = self._interpolated(corners, hits["primitive_uvs"].numpy()[hit]) @ T_cam_world[:3, :3].T
+        normals[hit] = seen * _towards_camera(seen, camera, hit)[:, None]
+        return normals
+
+    def _interpolated(self, corners: Array, uv: Array) -> Array:
+        """Unit normals (N, 3) at the barycentric `uv` (N, 2) of triangles (N, 3)."""
+        a, b, c = (self._surface.normals_world[corners[:, k]] for k in range(3))
+        mixed = (1.0 - uv.sum(axis=1, keepdims=True)) * a + uv[:, :1] * b + uv[:, 1:] * c
+        return np.asarray(mixed / np.maximum(np.linalg.norm(mixed, axis=1, keepdims=True), 1e-12))
+
+
+def _rays_world(camera: Camera, T_cam_world: Array) -> Array:
+    """(H, W, 6) float32 camera centre and direction of each pixel, in the world, as Open3D casts them."""
+    u, v = np.meshgrid(np.arange(camera.width, dtype=float), np.arange(camera.height, dtype=float))
+    directions = camera.rays_from_ideal(np.stack([u.ravel(), v.ravel()], axis=1)) @ T_cam_world[:3, :3]
+    center = np.broadcast_to(-T_cam_world[:3, :3].T @ T_cam_world[:3, 3], directions.shape)
+    return np.hstack([center, directions]).astype(np.float32).reshape(camera.height, camera.width, 6)
+
+
+def _towards_camera(normals: Array, camera: Camera, hit: Array) -> Array:
+    """(N,) 1 or -1: the sign that turns each normal of the pixels `hit` (H, W) to the camera."""
+    v, u = np.nonzero(hit)
+    rays = camera.rays_from_ideal(np.stack([u, v], axis=1).astype(np.float64))
+    return np.where((normals * rays).sum(axis=1) > 0, -1.0, 1.0)
