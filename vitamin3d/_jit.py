@@ -6,6 +6,7 @@
 """
 
 from collections.abc import Callable
+from pathlib import Path
 from typing import Any, TypeVar
 
 import numba
@@ -21,3 +22,9 @@ def kernel(function: _Function) -> _Function:
 def inlined(function: _Function) -> _Function:
     """Like `kernel`, for the small functions that kernels call: LLVM always inlines them."""
     return numba.njit(cache=True, nogil=True, error_model="numpy", forceinline=True)(function)  # type: ignore[no-any-return]
+
+
+def kernels_are_cached() -> bool:
+    """Whether an earlier run has left compiled kernels beside this package (or in `NUMBA_CACHE_DIR`)."""
+    folders = [Path(__file__).parent, *([Path(numba.config.CACHE_DIR)] if numba.config.CACHE_DIR else [])]
+    return any(next(folder.rglob("*.nbi"), None) is not None for folder in folders)

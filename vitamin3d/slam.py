@@ -216,11 +216,11 @@ class Slam:
 
     # --- what leaves ---------------------------------------------------------------------------------------------
 
-    def take_snapshots(self, everything: bool = False) -> list[MapSnapshot]:
-        """The keyframes that left the window since the last call (or all that remain), each once, for the dense half."""
+    def take_settled_keyframes(self, everything: bool = False) -> list[tuple[int, Frame]]:
+        """The keyframes that left the window since the last call (or all that remain), each once, with their frames."""
         settled = self.map.num_keyframes - (0 if everything else self.config.window.keyframes)
         ready = sorted(k for k in self._pending_frames if k < settled)
-        return [self.snapshot(k, self._pending_frames.pop(k)) for k in ready]
+        return [(k, self._pending_frames.pop(k)) for k in ready]
 
     def snapshot(self, keyframe: int, frame: Frame) -> MapSnapshot:
         """A keyframe with the depths of its landmarks as the map has them now."""

@@ -1,0 +1,135 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The folder of a finished run: names, units and comments of its files, in one place."""
+
+import io
+import json
+import shutil
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from vitamin3d.config import Config, dump_toml
+from vitamin3d.errors import OutputError
+from vitamin3d.exporters.depth_map import write_depth_map
+from vitamin3d.exporters.mesh import write_cloud_ply, write_file, write_obj, write_ply
+from vitamin3d.exporters.normal_map import write_normal_map
+from vitamin3d.exporters.trajectory import write_tum
+from vitamin3d.geometry.camera import Camera
+from vitamin3d.scale import Scale
+from vitamin3d.types import Array, DepthView, PointCloud, Surface, Trajectory
+
+FILES = (
+    "trajectory.tum",
+    "keyframes.tum",
+    "cloud.ply",
+    "mesh_low.ply",
+    "mesh_high.ply",
+    "mesh_high.obj",
+    "config.toml",
+    "stats.json",
+    "tracks.npz",
+)
+FOLDERS = ("normals", "depth")
+DEPTH_COUNTS_PER_METRE = 1000.0
+DEPTH_COUNTS_PER_UNIT = 5000.0
+PROGRAM = "vitamin3d"
+
+
+def depth_counts(scale: Scale) -> float:
+    """Counts of the depth PNGs per map unit: millimetres where the scale is known, else 5000 per unit."""
+    return DEPTH_COUNTS_PER_METRE * scale.metres_per_unit if scale.is_known else DEPTH_COUNTS_PER_UNIT
+
+
+class OutputFolder:
+    """Writes the results of one run; each file is complete or absent.
+
+    Args:
+        path: is made where it does not exist.
+        overwrite: an earlier result in it is removed; else it is refused.
+
+    Raises:
+        OutputError: it holds a result already, or cannot be written.
+    """
+
+    def __init__(self, path: Path, overwrite: bool = False) -> None:
+        self.path = path
+        try:
+            path.mkdir(parents=True, exist_ok=True)
+            earlier = [name for name in (*FILES, *FOLDERS) if (path / name).exists()]
+            if earlier and not overwrite:
+                raise OutputError(f"{path}: already holds a result ({', '.join(earlier[:3])}); choose another folder or add --overwrite")
+            write_file(path / "stats.json", [b"{}\n"])
+            self._remove([*earlier, "stats.json"])
+        except OSError as error:
+            raise OutputError(f"{path}: not a folder that can be written ({error.strerror}); choose another with -o") from None
+
+    def _remove(self, names: list[str]) -> None:
+        for name in names:
+            target = self.path / name
+            if target.is_dir():
+                shutil.rmtree(target)
+            else:
+                target.unlink(missing_ok=True)
+
+    def _folder(self, name: str) -> Path:
+        folder = self.path / name
+        try:
+            folder.mkdir(exist_ok=True)
+        except OSError as error:
+            raise OutputError(f"{folder}: cannot be made ({error.strerror}); free the disk or choose another with -o") from None
+        return folder
+
+    def write_config(self, config: Config) -> None:
+        write_file(self.path / "config.toml", [dump_toml(config).encode()])
+
+    def write_stats(self, stats: dict[str, Any]) -> None:
+        write_file(self.path / "stats.json", [(json.dumps(stats, indent=2) + "\n").encode()])
+
+    def write_trajectories(self, frames: Trajectory, keyframes: Trajectory, scale: Scale) -> None:
+        """`trajectory.tum` and `keyframes.tum`, camera to world."""
+        comments = [f"{PROGRAM}: camera to world, {scale.remark}", "timestamp tx ty tz qx qy qz qw"]
+        write_tum(scale.trajectory(frames), self.path / "trajectory.tum", comments)
+        write_tum(scale.trajectory(keyframes), self.path / "keyframes.tum", comments)
+
+    def write_cloud(self, cloud: PointCloud, scale: Scale, filter_remark: str) -> None:
+        """`cloud.ply`."""
+        write_cloud_ply(scale.cloud(cloud), self.path / "cloud.ply", [PROGRAM, scale.remark, filter_remark])
+
+    def write_surfaces(self, low: Surface, high: Surface, scale: Scale, voxels: tuple[float, float]) -> None:
+        """`mesh_low.ply`, `mesh_high.ply` and `mesh_high.obj`; voxels in map units."""
+        for name, surface, voxel in (("mesh_low", low, voxels[0]), ("mesh_high", high, voxels[1])):
+            comments = [PROGRAM, scale.remark, f"TSDF voxels of {voxel * scale.metres_per_unit:.6g} {scale.unit}"]
+            scaled = scale.surface(surface)
+            write_ply(scaled, self.path / f"{name}.ply", comments)
+            if name == "mesh_high":
+                write_obj(scaled, self.path / f"{name}.obj", comments)
+
+    def write_canvas(self, canvas: Camera, scale: Scale) -> None:
+        """`depth/canvas.yaml`: the pinhole camera of the depth and normal maps, and the unit of depth."""
+        counts = DEPTH_COUNTS_PER_METRE if scale.is_known else DEPTH_COUNTS_PER_UNIT
+        text = (
+            "# pinhole camera of the depth and normal maps: the undistorted picture on a canvas that holds all of it\n"
+            f"camera_model: pinhole\nintrinsics: [{canvas.fx!r}, {canvas.fy!r}, {canvas.cx!r}, {canvas.cy!r}]\n"
+            "distortion_model: radial-tangential\ndistortion_coefficients: [0.0, 0.0, 0.0, 0.0]\n"
+            f"resolution: [{canvas.width}, {canvas.height}]\n"
+            f"depth_counts_per_{'metre' if scale.is_known else 'map_unit'}: {counts}\n"
+        )
+        write_file(self._folder("depth") / "canvas.yaml", [text.encode()])
+
+    def write_view(self, view: DepthView, scale: Scale) -> None:
+        """`depth/<timestamp>.png` and `normals/<timestamp>.png` of a keyframe."""
+        name = f"{view.timestamp_ns // 10**9}.{view.timestamp_ns % 10**9:09d}.png"
+        write_depth_map(view.depth, self._folder("depth") / name, depth_counts(scale))
+        write_normal_map(view.normals_cam, self._folder("normals") / name)
+
+    def write_tracks(self, tracks: list[tuple[int, Array, Array]]) -> None:
+        """`tracks.npz`: frame_index (N,), track_id (N,) and pixel (N, 2), distorted, of all tracks in all frames."""
+        buffer = io.BytesIO()
+        np.savez_compressed(
+            buffer,
+            frame_index=np.concatenate([np.full(len(ids), index, np.int64) for index, ids, _ in tracks] or [np.zeros(0, np.int64)]),
+            track_id=np.concatenate([ids for _, ids, _ in tracks] or [np.zeros(0, np.int64)]),
+            pixel=np.concatenate([pixels for *_, pixels in tracks] or [np.zeros((0, 2))]).astype(np.float32),
+        )
+        write_file(self.path / "tracks.npz", [buffer.getvalue()])

@@ -1,0 +1,76 @@
+# SPDX-License-Identifier: Apache-2.0
+"""What the user sees of a run: a bar with an ETA on a terminal, plain lines elsewhere."""
+
+import signal
+import sys
+import time
+from types import FrameType
+
+from rich.console import Console
+from rich.progress import BarColumn, MofNCompleteColumn, Progress, TaskID, TextColumn, TimeElapsedColumn, TimeRemainingColumn
+
+from vitamin3d.datasets.pictures import Unreadable
+from vitamin3d.slam import Slam
+
+SECONDS_BETWEEN_LINES = 5.0
+
+
+class ConsoleObserver:
+    """Shows progress, prints warnings, and turns Ctrl-C into an orderly stop. Use as a context."""
+
+    def __init__(self, quiet: bool) -> None:
+        self._console = Console(file=sys.stderr, highlight=False, soft_wrap=True)
+        self._quiet, self._is_terminal = quiet, self._console.is_terminal and not quiet
+        self._progress = Progress(
+            TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn(), TextColumn("frames"),
+            TimeElapsedColumn(), TextColumn("ETA"), TimeRemainingColumn(), TextColumn("{task.fields[note]}"),
+            console=self._console, disable=not self._is_terminal,
+        )  # fmt: skip
+        self._tasks: dict[str, TaskID] = {}
+        self._last_line = time.monotonic()
+        self._started: dict[str, float] = {}
+        self._stop = False
+
+    def __enter__(self) -> "ConsoleObserver":
+        self._handler = signal.signal(signal.SIGINT, self._interrupt)
+        self._progress.start()
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self._progress.stop()
+        signal.signal(signal.SIGINT, self._handler)
+
+    def frame_done(self, done: int, total: int, slam: Slam) -> None:
+        note = f"{slam.state.value}, {slam.map.num_keyframes} keyframes, {len(slam.tracks)} tracks"
+        self._show("tracking and mapping", done, total, note)
+
+    def keyframe_done(self, done: int, total: int) -> None:
+        self._show("reconstructing", done, total, "")
+
+    def frame_skipped(self, reason: Unreadable) -> None:
+        self.line(f"warning: {reason.path}: {reason.reason}; skipped")
+
+    def should_stop(self) -> bool:
+        return self._stop
+
+    def line(self, text: str) -> None:
+        """A line above the bar."""
+        self._console.print(text, markup=False)
+
+    def _show(self, step: str, done: int, total: int, note: str) -> None:
+        if self._is_terminal:
+            if step not in self._tasks:
+                self._tasks[step] = self._progress.add_task(step, total=total, note=note)
+            self._progress.update(self._tasks[step], completed=done, note=note)
+        elif not self._quiet and (done == total or time.monotonic() - self._last_line > SECONDS_BETWEEN_LINES):
+            self._last_line = time.monotonic()
+            begun = self._started.setdefault(step, self._last_line)
+            eta = (self._last_line - begun) / max(1, done) * (total - done)
+            self.line(f"{step}: {done} of {total}, {note + ', ' if note else ''}{eta:.0f} s left")
+        self._started.setdefault(step, time.monotonic())
+
+    def _interrupt(self, number: int, frame: FrameType | None) -> None:
+        if self._stop:
+            raise KeyboardInterrupt
+        self._stop = True
+        self.line("stopping: what is reconstructed so far is being saved (Ctrl-C again: at once, nothing saved)")

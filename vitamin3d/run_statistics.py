@@ -1,0 +1,80 @@
+# SPDX-License-Identifier: Apache-2.0
+"""What a run reports about itself: `stats.json`."""
+
+import platform
+import resource
+import time
+from importlib.metadata import PackageNotFoundError, version
+from typing import Any
+
+import numpy as np
+
+from vitamin3d.runtime import RunRecord, median_of
+from vitamin3d.scale import Scale
+from vitamin3d.slam import Slam
+from vitamin3d.types import StepTimes
+
+PACKAGES = ("vitamin3d", "numpy", "scipy", "numba", "opencv-python-headless", "open3d", "pymeshlab")
+
+
+class Stopwatch:
+    """Wall and CPU seconds since it was made."""
+
+    def __init__(self) -> None:
+        self._wall, self._cpu = time.perf_counter(), time.process_time()
+
+    def seconds(self) -> dict[str, float]:
+        return {"wall_seconds": round(time.perf_counter() - self._wall, 3), "cpu_seconds": round(time.process_time() - self._cpu, 3)}
+
+
+def step_table(*times: StepTimes) -> dict[str, dict[str, float]]:
+    """Per step: how often it ran, median and 95th percentile in milliseconds, and all of it in seconds."""
+    return {step: _summary(values) for t in times for step, values in t.milliseconds.items()}
+
+
+def _summary(values: list[float]) -> dict[str, float]:
+    return {
+        "count": len(values),
+        "median_ms": round(float(np.median(values)), 3),
+        "p95_ms": round(float(np.percentile(values, 95)), 3),
+        "total_seconds": round(sum(values) / 1e3, 3),
+    }
+
+
+def versions() -> dict[str, str]:
+    """Versions of Python and of the packages that make the result."""
+    found = {"python": platform.python_version()}
+    for name in PACKAGES:
+        try:
+            found[name] = version(name)
+        except PackageNotFoundError:
+            found[name] = "not installed"
+    return found
+
+
+def run_statistics(
+    slam: Slam, record: RunRecord, scale: Scale, cloud_points: int, times: list[StepTimes], watch: Stopwatch
+) -> dict[str, Any]:
+    """The report of a run as a JSON object; lengths in metres where the scale is known."""
+    tracked, metres = len(slam.poses), scale.metres_per_unit if scale.is_known else None
+    return {
+        "frames": record.num_frames,
+        "processed_frames": len(record.states),
+        "unreadable_frames": len(record.skipped),
+        "tracked_frames": tracked,
+        "success_rate": round(tracked / max(1, record.num_frames), 6),
+        "state": slam.state.value,
+        "interrupted": record.interrupted,
+        "initialization_retries": slam.initialization_retries,
+        "initialization_failure": slam.initialization_reason,
+        "keyframes": slam.map.num_keyframes,
+        "landmarks": int(np.isfinite(slam.map.points_world[:, 0]).sum()),
+        "cloud_points": cloud_points,
+        "median_live_tracks": median_of(record.live_tracks),
+        "scale": {"known": scale.is_known, "metres_per_map_unit": metres, "source": scale.source},
+        "unit": scale.unit if scale.is_known else "map unit (up to scale)",
+        "steps": step_table(*times),
+        **watch.seconds(),
+        "peak_memory_mb": round(resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024, 1),
+        "versions": versions(),
+    }
