@@ -28,7 +28,7 @@ class DepthRenderer:
         layers = np.column_stack([mesh.inverse_depth, slopes])
         drawn = rasterize(mesh.pixels + shift, kept, layers, self.canvas.width, self.canvas.height)
         drawn[self._is_outside] = 0.0
-        depth, normals = depth_from_inverse(drawn[..., 0]), normals_from_slopes(drawn, self.canvas)
+        depth, normals = depth_and_normals(drawn, self.canvas)
         return DepthView(snapshot.frame.timestamp_ns, snapshot.T_cam_world, depth, normals, self._draw_color(snapshot.frame))
 
     def _draw_color(self, frame: Frame) -> Array:
@@ -72,11 +72,12 @@ def _rasterize(pixels, triangles, layers, out):  # type: ignore[no-untyped-def]
         bottom = min(height - 1, int(np.floor(av + max(0.0, max(bv, cv)))))
         left = max(0, int(np.ceil(au + min(0.0, min(bu, cu)))))
         right = min(width - 1, int(np.floor(au + max(0.0, max(bu, cu)))))
+        bu, bv, cu, cv = bu / area, bv / area, cu / area, cv / area
         for v in range(top, bottom + 1):
             entered = False
             for u in range(left, right + 1):
-                s = ((u - au) * cv - (v - av) * cu) / area
-                t = ((v - av) * bu - (u - au) * bv) / area
+                s = (u - au) * cv - (v - av) * cu
+                t = (v - av) * bu - (u - au) * bv
                 if s < -slack or t < -slack or s + t > 1.0 + slack:
                     if entered:
                         break
@@ -102,23 +103,29 @@ def rasterize(pixels: Array, triangles: Array, layers: Array, width: int, height
     return out
 
 
-def depth_from_inverse(inverse_depth: Array) -> Array:
-    """Depth float32 of an image of inverse depths; 0 stays 0."""
-    return np.divide(1.0, inverse_depth, out=np.zeros_like(inverse_depth), where=inverse_depth > 0).astype(np.float32)
+@kernel
+def _shade(layers, intrinsics, depth, normals):  # type: ignore[no-untyped-def]
+    """The plane <n, X> = 1 has the inverse depth <n, ray>: its gradient gives n_x / fx and n_y / fy, n_z is what remains."""
+    fx, fy, cx, cy = intrinsics
+    for v in range(layers.shape[0]):
+        y = (v - cy) / fy
+        for u in range(layers.shape[1]):
+            xi = layers[v, u, 0]
+            if not xi > 0.0:
+                continue
+            nx, ny = layers[v, u, 1] * fx, layers[v, u, 2] * fy
+            nz = xi - nx * (u - cx) / fx - ny * y
+            length = np.sqrt(nx * nx + ny * ny + nz * nz)
+            depth[v, u] = 1.0 / xi
+            normals[v, u, 0], normals[v, u, 1], normals[v, u, 2] = -nx / length, -ny / length, -nz / length
 
 
-def normals_from_slopes(layers: Array, canvas: Camera) -> Array:
-    """Unit normals (H, W, 3) float32 in the camera frame, towards the camera, of images of inverse depth and its gradient.
-
-    The plane <n, X> = 1 has the inverse depth <n, ray>, so its gradient gives n_x / fx and n_y / fy, and n_z is what remains.
+def depth_and_normals(layers: Array, canvas: Camera) -> tuple[Array, Array]:
+    """Depth (H, W) float32 and unit normals (H, W, 3) float32 in the camera frame, towards the camera; 0 where there is none.
 
     Args:
-        layers: (H, W, 3) `[xi, d xi / du, d xi / dv]` on the canvas; xi = 0 where there is nothing (the normal is 0 there).
+        layers: (H, W, 3) inverse depth and its gradient per pixel, `[xi, d xi / du, d xi / dv]`; xi = 0 where there is nothing.
     """
-    x = (np.arange(canvas.width) - canvas.cx) / canvas.fx
-    y = (np.arange(canvas.height) - canvas.cy) / canvas.fy
-    nx, ny = layers[..., 1] * canvas.fx, layers[..., 2] * canvas.fy
-    nz = layers[..., 0] - nx * x - ny * y[:, None]
-    normals = -np.stack([nx, ny, nz], axis=-1)
-    normals[layers[..., 0] <= 0] = 0.0
-    return np.asarray(normals / np.maximum(np.linalg.norm(normals, axis=-1, keepdims=True), 1e-300), np.float32)
+    depth, normals = np.zeros(layers.shape[:2], np.float32), np.zeros((*layers.shape[:2], 3), np.float32)
+    _shade(layers, canvas.intrinsics, depth, normals)
+    return depth, normals

@@ -45,7 +45,7 @@ def _scaled_normals(vertices: Array, triangles: Array) -> Array:
 def _corner_sums(values: Array, triangles: Array, count: int) -> Array:
     """(count, 3) sums of the triangles' values (F, 3) over the triangles around each vertex."""
     corners = triangles.ravel()
-    return np.stack([np.bincount(corners, np.repeat(values[:, k], 3), count) for k in range(3)], axis=1)
+    return np.stack([np.bincount(corners, np.repeat(values[:, k], 3), count) for k in range(3)], axis=1).astype(np.float64)
 
 
 def _has_area(surface: Surface) -> Array:

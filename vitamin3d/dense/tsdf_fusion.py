@@ -36,7 +36,8 @@ class TsdfVolume:
 
     def integrate(self, view: DepthView, canvas: Camera, max_depth: float) -> None:
         """Averages a view, drawn on `canvas`, into the volume; depths beyond `max_depth` (map units) are left out."""
-        self._volume.integrate(view, canvas, max_depth)
+        if ((view.depth > 0) & (view.depth < max_depth)).any():
+            self._volume.integrate(view, canvas, max_depth)
 
     def extract_surface(self) -> Surface:
         """The zero level (marching cubes), triangles facing the cameras; vertex normals are not filled in yet (zero)."""
@@ -111,8 +112,10 @@ class _VoxelBlockGrid:
         self._grid.integrate(blocks, depth, color, K, K, T, *scales)
 
     def extract_surface(self) -> Surface:
+        if self._grid.hashmap().size() == 0:
+            return empty_surface()
         mesh = self._grid.extract_triangle_mesh(weight_threshold=0.5)
-        if not len(mesh.vertex.positions):
+        if "positions" not in mesh.vertex or not len(mesh.vertex.positions):
             return empty_surface()
         return _surface(mesh.vertex.positions.numpy(), mesh.triangle.indices.numpy(), mesh.vertex.colors.numpy())
 

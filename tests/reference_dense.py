@@ -1,0 +1,115 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Slow, obvious twins of the kernels of `vitamin3d.dense`, and the small scenes that its tests share."""
+
+import itertools
+
+import numpy as np
+
+from vitamin3d.geometry.camera import Camera
+from vitamin3d.types import Frame, MapSnapshot
+
+EUROC = Camera(458.654, 457.296, 367.215, 248.375, 752, 480, (-0.28340811, 0.07395907, 0.00019359, 1.76187114e-05))
+SMALL = Camera(100.0, 100.0, 63.5, 47.5, 128, 96)
+
+
+def snapshot_of_plane(camera, normal, count, rng, deviation=0.01, T_cam_world=None):
+    """Landmarks on the plane <normal, X_cam> = 1 at random pixels, without noise; the picture is a grey ramp."""
+    pixels = rng.uniform(0, [camera.width - 1, camera.height - 1], (count, 2))
+    depths = 1.0 / (camera.rays_from_ideal(pixels) @ np.asarray(normal, float))
+    image = np.tile(np.linspace(50, 200, camera.width).astype(np.uint8), (camera.height, 1))
+    T = np.eye(4) if T_cam_world is None else T_cam_world
+    return MapSnapshot(Frame(0, 7, image), T, pixels, depths, np.full(count, deviation))
+
+
+def edges_of(triangles):
+    """The set of edges, each once."""
+    pairs = {tuple(sorted((int(a), int(b)))) for t in triangles for a, b in itertools.combinations(t, 2)}
+    return np.array(sorted(pairs))
+
+
+def nltgv_objective(problem, state):
+    energy = 0.0
+    for (i, j), d in zip(problem.edges, problem.offsets, strict=True):
+        energy += abs(state[i, 0] - state[j, 0] - state[i, 1:] @ d) / np.linalg.norm(d)
+        energy += problem.beta * np.abs(state[i, 1:] - state[j, 1:]).sum()
+    for v, z in enumerate(problem.data):
+        energy += problem.data_weights[v] * abs(state[v, 0] - z)
+    return energy
+
+
+def nltgv_matrix(problem):
+    """K (3 E, 3 V) dense: the first two terms of the energy are |K x|_1 with x = (xi, w_u, w_v) of every vertex."""
+    K = np.zeros((3 * len(problem.edges), 3 * len(problem.data)))
+    for e, ((i, j), d) in enumerate(zip(problem.edges, problem.offsets, strict=True)):
+        alpha = 1.0 / np.linalg.norm(d)
+        K[3 * e, 3 * i], K[3 * e, 3 * j] = alpha, -alpha
+        K[3 * e, 3 * i + 1], K[3 * e, 3 * i + 2] = -alpha * d[0], -alpha * d[1]
+        for k in (1, 2):
+            K[3 * e + k, 3 * i + k], K[3 * e + k, 3 * j + k] = problem.beta, -problem.beta
+    return K
+
+
+def nltgv_solve(problem, start, iterations):
+    """Pock and Chambolle (2011), Algorithm 1 with alpha = 1, on the dense matrix."""
+    K = nltgv_matrix(problem)
+    sigma, tau = 1.0 / np.abs(K).sum(axis=1), 1.0 / np.abs(K).sum(axis=0)
+    z, threshold = problem.data, tau[0::3] * problem.data_weights
+    x, q = start.ravel().copy(), np.zeros(len(K))
+    x_bar = x.copy()
+    for _ in range(iterations):
+        q = np.clip(q + sigma * (K @ x_bar), -1.0, 1.0)
+        moved = x - tau * (K.T @ q)
+        residual = moved[0::3] - z
+        moved[0::3] = z + np.sign(residual) * np.maximum(np.abs(residual) - threshold, 0.0)
+        x_bar, x = 2.0 * moved - x, moved
+    return x.reshape(-1, 3)
+
+
+def rasterize(pixels, triangles, layers, width, height):
+    """Every pixel against every triangle, by barycentric coordinates."""
+    out = np.zeros((height, width, layers.shape[1]))
+    for v, u in itertools.product(range(height), range(width)):
+        for t in triangles:
+            corners = np.vstack([pixels[t].T, np.ones(3)])
+            if abs(np.linalg.det(corners)) < 1e-12:
+                continue
+            weights = np.linalg.solve(corners, [u, v, 1.0])
+            value = weights @ layers[t]
+            if weights.min() >= -1e-9 and value[0] > out[v, u, 0]:
+                out[v, u] = value
+    return out
+
+
+def depth_and_normals(layers, camera):
+    """From three points of each pixel's plane."""
+    depth, normals = np.zeros(layers.shape[:2]), np.zeros(layers.shape)
+    for v, u in zip(*np.nonzero(layers[..., 0]), strict=True):
+        xi, slope = layers[v, u, 0], layers[v, u, 1:]
+        step = 1e-3 * xi / (np.abs(slope).max() + 1e-9)
+        near = np.array([[u, v], [u + step, v], [u, v + step]], float)
+        a, b, c = camera.rays_from_ideal(near) / (xi + (near - near[0]) @ slope)[:, None]
+        normal = np.cross(b - a, c - a)
+        depth[v, u], normals[v, u] = a[2], -np.sign(normal @ a) * normal / np.linalg.norm(normal)
+    return depth, normals
+
+
+def component_sizes(triangles):
+    """Flood fill over triangles that share a vertex."""
+    left, sizes = set(range(len(triangles))), np.zeros(len(triangles), int)
+    while left:
+        piece, grown = set(), {min(left)}
+        while grown:
+            piece |= grown
+            corners = {int(v) for f in grown for v in triangles[f]}
+            grown = {f for f in left - piece if corners & {int(v) for v in triangles[f]}}
+        sizes[list(piece)] = len(piece)
+        left -= piece
+    return sizes
+
+
+def vertex_normals(vertices, triangles):
+    normals = np.zeros_like(vertices)
+    for a, b, c in triangles:
+        for v in (a, b, c):
+            normals[v] += np.cross(vertices[b] - vertices[a], vertices[c] - vertices[a])
+    return np.array([n / np.linalg.norm(n) if np.linalg.norm(n) > 0 else n for n in normals])

@@ -1,0 +1,140 @@
+# SPDX-License-Identifier: Apache-2.0
+import numpy as np
+import pytest
+import reference_dense as reference
+
+from vitamin3d.errors import InputError, OutputError
+from vitamin3d.exporters.depth_map import counts_from_depth, read_depth_map, write_depth_map, write_png
+from vitamin3d.exporters.mesh import read_ply, write_cloud_ply, write_obj, write_ply
+from vitamin3d.exporters.normal_map import cast_normal_map, rgb_from_normals, write_normal_map
+from vitamin3d.geometry.se3 import exp_se3
+from vitamin3d.types import PointCloud, Surface
+
+pytestmark = pytest.mark.filterwarnings("ignore:Open3D was built with CUDA:ImportWarning")
+
+
+@pytest.fixture
+def surface():
+    """The square |x|, |y| < 1 at z = 2, facing -z."""
+    vertices = np.array([[-1.0, -1, 2], [1, -1, 2], [1, 1, 2], [-1, 1, 2]])
+    triangles = np.array([[0, 2, 1], [0, 3, 2]], np.int32)
+    colors = np.array([[0, 128, 255], [1, 2, 3], [4, 5, 6], [250, 251, 252]], np.uint8)
+    return Surface(vertices, triangles, np.tile([0.0, 0.0, -1.0], (4, 1)), colors)
+
+
+def test_ply_comes_back(surface, tmp_path):
+    write_ply(surface, tmp_path / "a.ply", ["unit: metre", "two\nlines"])
+    back = read_ply(tmp_path / "a.ply")
+    for name in ("vertices_world", "triangles", "normals_world", "colors"):
+        np.testing.assert_array_equal(getattr(back, name), getattr(surface, name))
+    assert b"\ncomment unit: metre\ncomment two\ncomment lines\n" in (tmp_path / "a.ply").read_bytes()
+    assert [p.name for p in tmp_path.iterdir()] == ["a.ply"]
+
+
+@pytest.mark.parametrize(("write", "name"), [(write_ply, "a.ply"), (write_obj, "a.obj")])
+def test_open3d_reads_meshes(write, name, surface, tmp_path):
+    write(surface, tmp_path / name, ["a comment"])
+    import open3d as o3d
+
+    mesh = o3d.io.read_triangle_mesh(str(tmp_path / name))
+    corners = np.asarray(mesh.triangles)  # Open3D numbers the vertices of an OBJ anew
+    np.testing.assert_allclose(np.asarray(mesh.vertices)[corners], surface.vertices_world[surface.triangles])
+    np.testing.assert_allclose(np.asarray(mesh.vertex_normals)[corners], surface.normals_world[surface.triangles])
+    np.testing.assert_allclose(np.asarray(mesh.vertex_colors)[corners], surface.colors[surface.triangles] / 255.0, atol=1e-3)
+
+
+def test_obj_text(surface, tmp_path):
+    write_obj(surface, tmp_path / "a.obj", ["a comment"])
+    lines = (tmp_path / "a.obj").read_text().splitlines()
+    assert lines[0] == "# a comment" and lines[1] == "v -1 -1 2 0 0.502 1"
+    assert lines[5] == "vn 0 0 -1" and lines[-1] == "f 1//1 4//4 3//3"
+
+
+def test_clouds_keep_all_properties(tmp_path):
+    rng = np.random.default_rng(0)
+    quality = [rng.random(5).astype(np.float32) for _ in range(3)]
+    cloud = PointCloud(rng.random((5, 3)), rng.integers(0, 255, (5, 3)).astype(np.uint8), np.arange(5, dtype=np.int32), *quality)
+    write_cloud_ply(cloud, tmp_path / "c.ply", ["parallax > 1 degree"])
+    import open3d as o3d
+
+    read = o3d.t.io.read_point_cloud(str(tmp_path / "c.ply")).point
+    np.testing.assert_allclose(read.positions.numpy(), cloud.points_world, rtol=1e-6)
+    np.testing.assert_array_equal(read.colors.numpy(), cloud.colors)
+    for name in ("num_observations", "parallax_deg", "reprojection_rms_px", "depth_deviation"):
+        np.testing.assert_array_equal(read[name].numpy().ravel(), getattr(cloud, name))
+
+
+@pytest.mark.parametrize("content", [b"", b"ply\nformat ascii 1.0\nelement vertex x\nend_header\n", b"\xff\x00" * 50])
+def test_foreign_files_are_refused(content, tmp_path):
+    (tmp_path / "a.ply").write_bytes(content)
+    with pytest.raises(InputError, match=r"a\.ply"):
+        read_ply(tmp_path / "a.ply")
+
+
+def test_cut_and_missing_files_are_refused(surface, tmp_path):
+    with pytest.raises(InputError, match=r"none\.ply"):
+        read_ply(tmp_path / "none.ply")
+    write_ply(surface, tmp_path / "a.ply", [])
+    (tmp_path / "a.ply").write_bytes((tmp_path / "a.ply").read_bytes()[:-1])
+    with pytest.raises(InputError, match="cut short"):
+        read_ply(tmp_path / "a.ply")
+
+
+def test_folders_that_cannot_be_written_are_named(surface, tmp_path):
+    (tmp_path / "file").write_text("")
+    for folder in ("missing", "file"):
+        with pytest.raises(OutputError, match=rf"{folder}/a\.ply: cannot be written"):
+            write_ply(surface, tmp_path / folder / "a.ply", [])
+        with pytest.raises(OutputError, match=rf"{folder}/a\.png: cannot be written"):
+            write_png(np.zeros((2, 2), np.uint8), tmp_path / folder / "a.png")
+
+
+def test_a_full_disk_leaves_the_old_file_and_no_other(surface, tmp_path, monkeypatch):
+    write_ply(surface, tmp_path / "a.ply", [])
+    before = (tmp_path / "a.ply").read_bytes()
+
+    def fail(self, target):
+        raise OSError(28, "No space left on device")
+
+    monkeypatch.setattr("pathlib.Path.replace", fail)
+    with pytest.raises(OutputError, match="No space left"):
+        write_ply(surface, tmp_path / "a.ply", ["longer"])
+    assert [p.name for p in tmp_path.iterdir()] == ["a.ply"] and (tmp_path / "a.ply").read_bytes() == before
+
+
+def test_depth_maps_come_back_to_half_a_count(tmp_path):
+    depth = np.array([[0.0, 0.5, 1.2345], [13.0, 14.0, np.nan]], np.float32)
+    write_depth_map(depth, tmp_path / "d.png", 5000.0)
+    back = read_depth_map(tmp_path / "d.png", 5000.0)
+    np.testing.assert_allclose(back, [[0, 0.5, 1.2345], [13.0, 0, 0]], atol=0.5 / 5000)
+    assert counts_from_depth(depth, 1.0).dtype == np.uint16
+    (tmp_path / "x.png").write_bytes(b"no picture")
+    with pytest.raises(InputError):
+        read_depth_map(tmp_path / "x.png", 1.0)
+
+
+def test_colours_of_normals():
+    normals = np.array([[[0, 0, -1], [1, 0, 0], [0, -1, 0], [0, 0, 0]]], np.float32)
+    assert rgb_from_normals(normals).tolist() == [[[128, 128, 255], [255, 128, 128], [128, 255, 128], [0, 0, 0]]]
+    to_world = exp_se3(np.array([0, 0, 0, 0, np.pi / 2, 0]))[:3, :3]  # camera z is world x
+    np.testing.assert_allclose(rgb_from_normals(normals, to_world)[0, 0], [0, 128, 128], atol=1)
+
+
+def test_normal_maps_are_rgb_files(tmp_path):
+    import cv2
+
+    write_normal_map(np.array([[[0, 0, -1.0]]]), tmp_path / "n.png")
+    assert cv2.imread(str(tmp_path / "n.png"))[0, 0].tolist() == [255, 128, 128]  # OpenCV reads BGR
+
+
+@pytest.mark.parametrize("flip", [1.0, -1.0])
+def test_cast_normals_face_the_camera_at_the_pixels_of_the_mesh(surface, flip):
+    surface.normals_world[:] *= flip
+    T_cam_world = exp_se3(np.array([0.03, 0.02, 0.1, 0.1, 0.2, 0.3]))
+    normals = cast_normal_map(surface, reference.SMALL, T_cam_world)
+    pixels = np.argwhere((normals != 0).any(axis=2))[:, ::-1].astype(float)
+    rays = reference.SMALL.rays_from_ideal(pixels) @ T_cam_world[:3, :3]
+    center = -T_cam_world[:3, :3].T @ T_cam_world[:3, 3]
+    hits = center + rays * ((2.0 - center[2]) / rays[:, 2])[:, None]
+    assert np.abs(hits[:, :2]).max() < 1.0 + 1e-5 and len(hits) > 1000
+    np.testing.assert_allclose(normals[(normals != 0).any(axis=2)] @ T_cam_world[:3, :3], np.tile([0.0, 0, -1], (len(hits), 1)), atol=1e-5)

@@ -1,0 +1,83 @@
+# SPDX-License-Identifier: Apache-2.0
+import dataclasses
+
+import numpy as np
+import pytest
+import reference_dense as reference
+
+from vitamin3d.config import Config, DelaunayConfig, FusionConfig, SurfaceConfig
+from vitamin3d.geometry.se3 import exp_se3, inverse
+from vitamin3d.reconstruction import Reconstruction
+from vitamin3d.types import StepTimes
+
+pytestmark = pytest.mark.filterwarnings("ignore:Open3D was built with CUDA:ImportWarning")
+NORMAL_WORLD, OFFSET = np.array([0.1, 0.2, 1.0]), 3.0
+CONFIG = dataclasses.replace(Config(), delaunay=DelaunayConfig(min_vertices=20), surface=SurfaceConfig(min_component_triangles=20))
+
+
+def snapshots(count=4, noise=0.01, landmarks=800, unit=1.0):
+    """Views of the plane <NORMAL_WORLD, X> = OFFSET from a camera that moves sideways, in map units of `unit`."""
+    rng = np.random.default_rng(0)
+    for k in range(count):
+        T_world_cam = exp_se3(np.array([0.15 * k, -0.05 * k, 0.0, 0.02 * k, -0.03 * k, 0.01]))
+        distance = OFFSET - NORMAL_WORLD @ T_world_cam[:3, 3]
+        T_world_cam[:3, 3] *= unit
+        normal_cam = T_world_cam[:3, :3].T @ NORMAL_WORLD / (distance * unit)
+        snapshot = reference.snapshot_of_plane(reference.SMALL, normal_cam, landmarks, rng, noise, inverse(T_world_cam))
+        depths = snapshot.depths * (1 + noise * rng.standard_normal(landmarks))
+        yield dataclasses.replace(snapshot, depths=depths)
+
+
+def run(config=CONFIG, **scene):
+    reconstruction = Reconstruction(reference.SMALL, config, StepTimes())
+    views = [reconstruction.add_keyframe(snapshot) for snapshot in snapshots(**scene)]
+    return reconstruction, views
+
+
+def distances(surface):
+    return np.abs(surface.vertices_world @ NORMAL_WORLD - OFFSET) / np.linalg.norm(NORMAL_WORLD)
+
+
+def test_a_noisy_plane_becomes_a_smooth_surface():
+    reconstruction, views = run()
+    low, high = reconstruction.surfaces()
+    assert 0 < np.median(distances(high)) < 0.006 and 0 < np.median(distances(low)) < 0.02
+    assert len(high.triangles) > 20 * len(low.triangles) > 0
+    toward = high.normals_world @ NORMAL_WORLD / np.linalg.norm(NORMAL_WORLD)
+    assert np.median(toward) < -0.995
+    assert all(view.depth.max() > 0 for view in views)
+
+
+def test_all_steps_are_timed():
+    reconstruction, _ = run(count=2)
+    reconstruction.surfaces()
+    counts = {step: len(times) for step, times in reconstruction.times.milliseconds.items()}
+    each = dict.fromkeys(("meshing", "denoising", "rendering", "fusion_low", "fusion_high"), 2)
+    assert counts == {**each, "surface_low": 1, "surface_high": 1}
+
+
+def test_keyframes_without_landmarks_are_passed_over():
+    reconstruction, views = run(landmarks=10)
+    assert views == [None] * 4
+    assert all(len(surface.triangles) == 0 for surface in reconstruction.surfaces())
+
+
+def test_voxels_follow_the_depth_of_the_scene_or_the_settings():
+    reconstruction, _ = run(count=1)
+    low, high = reconstruction.voxel_lengths()
+    depth = reconstruction.median_depths[0]
+    assert (low, high) == pytest.approx((depth / 20, depth / 120)) and 2.5 < depth < 3.1
+    fixed = dataclasses.replace(CONFIG, fusion=FusionConfig(voxel_low=0.2, voxel_high=0.05))
+    assert run(fixed, count=1)[0].voxel_lengths() == (0.2, 0.05)
+
+
+def test_the_map_unit_does_not_matter():
+    (_, metres), (_, tiny) = (run(unit=unit)[0].surfaces() for unit in (1.0, 0.01))
+    assert len(tiny.triangles) == pytest.approx(len(metres.triangles), rel=0.02)
+    assert np.median(np.abs(tiny.vertices_world @ NORMAL_WORLD - 0.01 * OFFSET)) < 0.01 * 0.006
+
+
+def test_two_runs_are_equal():
+    one, other = (run(count=2)[0].surfaces()[1] for _ in range(2))
+    np.testing.assert_array_equal(one.vertices_world, other.vertices_world)
+    np.testing.assert_array_equal(one.triangles, other.triangles)
