@@ -70,7 +70,8 @@ def test_backends_agree_to_a_fraction_of_a_voxel():
     for a, b in ((one, other), (other, one)):
         distances = distances_to_surface(a.vertices_world, b)
         assert np.median(distances) < 0.05 * VOXEL
-        assert np.quantile(distances, 0.95) < 0.3 * VOXEL  # their borders lie half a voxel apart
+        assert np.quantile(distances, 0.8) < 0.1 * VOXEL
+        assert np.quantile(distances, 0.99) < 0.8 * VOXEL  # borders and silhouettes lie half a voxel apart
 
 
 @pytest.mark.parametrize("backend", list(BACKENDS))
