@@ -12,8 +12,9 @@ from vitamin3d.datasets.pictures import PICTURE_SUFFIXES
 from vitamin3d.datasets.tables import nanoseconds_from_seconds, regular_timestamps
 from vitamin3d.errors import InputError
 
-NANOSECOND_STEM = re.compile(r"\d{16,18}")
-SECOND_STEM = re.compile(r"\d{1,10}\.\d+")
+DIGITS = "0123456789"
+NANOSECOND_STEM = re.compile(r"[0-9]{16,18}|[0-8][0-9]{18}")
+SECOND_STEM = re.compile(r"[0-9]{1,9}\.[0-9]+|[0-8][0-9]{9}\.[0-9]+")
 
 
 def pictures_in(folder: Path) -> list[Path]:
@@ -28,7 +29,7 @@ def pictures_in(folder: Path) -> list[Path]:
 def natural_key(name: str) -> tuple[list[tuple[bool, int, str]], str]:
     """Sorting key that compares the runs of digits in a name as numbers."""
     parts = re.findall(r"[0-9]+|[^0-9]+", name)
-    return [(part[0].isdigit(), int(part) if part[0].isdigit() else 0, part.lower()) for part in parts], name
+    return [(part[0] not in DIGITS, int(part) if part[0] in DIGITS else 0, part.lower()) for part in parts], name
 
 
 class ImageFolderDataset(PictureSequence):
