@@ -76,7 +76,7 @@ def video(tmp_path: Path, name: str = "clip.avi", count: int = 8, fps: float = 2
     path = tmp_path / name
     writer = cv2.VideoWriter(str(path), cv2.VideoWriter.fourcc(*"MJPG"), fps, (64, 48))
     for i in range(count):
-        writer.write(np.full((48, 64, 3), 25 * i, np.uint8))
+        writer.write(np.full((48, 64, 3), 25 * i % 250, np.uint8))
     writer.release()
     return path
 
