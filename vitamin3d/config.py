@@ -214,7 +214,7 @@ class FusionConfig:
 @dataclass(frozen=True)
 class SurfaceConfig:
     min_component_triangles: int = 200
-    """Smaller connected pieces of the mesh are removed."""
+    """Smaller connected pieces of the fine mesh are removed, and pieces of the same area of the coarse one."""
 
 
 @dataclass(frozen=True)

@@ -4,6 +4,7 @@
 import time
 from collections.abc import Iterator
 from contextlib import contextmanager
+from dataclasses import replace
 
 import numpy as np
 
@@ -79,7 +80,11 @@ class Reconstruction:
         return TsdfVolume(voxel_length, self.config.fusion.truncation_voxels * voxel_length, self.config.fusion.backend)
 
     def _surface(self, volume: TsdfVolume | None) -> Surface:
-        return clean(volume.extract_surface(), self.config.surface) if volume else empty_surface()
+        if volume is None or self.high is None:
+            return empty_surface()
+        coarser = volume.voxel_length / self.high.voxel_length
+        least = round(self.config.surface.min_component_triangles / coarser**2)
+        return clean(volume.extract_surface(), replace(self.config.surface, min_component_triangles=least))
 
     @contextmanager
     def _timed(self, step: str) -> Iterator[None]:

@@ -1,0 +1,91 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The tools that export from a finished run, on a folder with a bumpy square before one camera."""
+
+import importlib.util
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+
+from vitamin3d.dense.surface_extraction import vertex_normals
+from vitamin3d.exporters.mesh import read_ply, write_ply
+from vitamin3d.types import Surface
+
+pytestmark = pytest.mark.filterwarnings("ignore:Open3D was built with CUDA:ImportWarning")
+TOOLS = Path(__file__).parents[2] / "tools"
+SIDE = 41
+
+
+def tool(name):
+    spec = importlib.util.spec_from_file_location(name, TOOLS / f"{name}.py")
+    module = importlib.util.module_from_spec(spec)
+    spec.loader.exec_module(module)
+    return module
+
+
+@pytest.fixture
+def run(tmp_path):
+    x, y = np.meshgrid(np.linspace(-1, 1, SIDE), np.linspace(-1, 1, SIDE))
+    vertices = np.column_stack([x.ravel(), y.ravel(), 2 + 0.05 * np.sin(5 * x.ravel())])
+    corner = (np.arange(SIDE - 1)[:, None] * SIDE + np.arange(SIDE - 1)).ravel()
+    triangles = np.vstack([np.stack([corner, corner + SIDE, corner + 1], 1), np.stack([corner + 1, corner + SIDE, corner + SIDE + 1], 1)])
+    colors = np.tile(np.array([[200, 100, 50]], np.uint8), (len(vertices), 1))
+    surface = Surface(vertices, triangles.astype(np.int32), vertex_normals(vertices, triangles), colors)
+    for name in ("mesh_high.ply", "mesh_low.ply"):
+        write_ply(surface, tmp_path / name, [])
+    (tmp_path / "keyframes.tum").write_text("".join(f"{k}.000000001 0 0 {0.1 * k} 0 0 0 1\n" for k in range(1, 4)))
+    (tmp_path / "depth").mkdir()
+    (tmp_path / "depth" / "canvas.yaml").write_text(
+        "camera_model: pinhole\nintrinsics: [60.0, 60.0, 39.5, 29.5]\ndistortion_model: radial-tangential\n"
+        "distortion_coefficients: [0.0, 0.0, 0.0, 0.0]\nresolution: [80, 60]\n"
+    )
+    return tmp_path
+
+
+@pytest.mark.parametrize("kind", ["ply", "obj", "glb"])
+def test_every_format_can_be_opened(run, kind, capsys):
+    import open3d as o3d
+
+    assert tool("export_mesh").main([str(run), "--format", kind]) == 0
+    path = Path(capsys.readouterr().out.strip())
+    mesh = o3d.io.read_triangle_mesh(str(path))
+    assert path == run / f"mesh_high_export.{kind}" and len(mesh.triangles) == 2 * (SIDE - 1) ** 2
+    assert np.abs(np.asarray(mesh.vertex_colors) - np.array([200, 100, 50]) / 255).max() < 0.01
+    assert np.sign(np.asarray(mesh.vertices)[:, 2].mean()) == (-1 if kind == "glb" else 1)
+
+
+def test_simplified_meshes_keep_shape_and_colour(run):
+    pytest.importorskip("pymeshlab")
+    assert tool("export_mesh").main([str(run), "--simplify", "400", "--output", str(run / "small.ply")]) == 0
+    small = read_ply(run / "small.ply")
+    assert 200 < len(small.triangles) <= 400
+    assert np.abs(small.vertices_world[:, 2] - 2 - 0.05 * np.sin(5 * small.vertices_world[:, 0])).max() < 0.02
+    assert np.abs(small.colors.astype(int) - [200, 100, 50]).max() <= 1
+    assert (small.normals_world[:, 2] < 0).all()
+
+
+@pytest.mark.parametrize("frame", ["camera", "world"])
+def test_normal_maps_of_every_second_keyframe(run, frame):
+    assert tool("export_normal_maps").main([str(run), "--every", "2", "--frame", frame, "--mesh", "low"]) == 0
+    files = sorted((run / "normals_mesh_low").iterdir())
+    assert [f.name for f in files] == ["1.000000001.png", "3.000000001.png"]
+    blue, green, _ = cv2.imread(str(files[0]))[30, 40]
+    assert (blue > 240) == (frame == "camera") and abs(int(green) - 128) <= 1
+    assert (cv2.imread(str(files[0])) > 0).any(axis=2).mean() < (cv2.imread(str(files[1])) > 0).any(axis=2).mean() <= 1
+
+
+MISTAKES = [["--output", "a.stl"], ["--simplify", "0"], ["--output", "missing/a.glb"], ["--output", "missing/a.ply"]]
+
+
+@pytest.mark.parametrize("arguments", MISTAKES)
+def test_mistakes_become_one_line(run, arguments, capsys, monkeypatch):
+    monkeypatch.chdir(run)
+    assert tool("export_mesh").main([str(run), *arguments]) == 2
+    assert capsys.readouterr().err.splitlines()[-1].startswith("export_mesh: ")
+
+
+def test_an_unfinished_run_is_refused(tmp_path, capsys):
+    assert tool("export_normal_maps").main([str(tmp_path)]) == 2
+    assert tool("export_mesh").main([str(tmp_path)]) == 2
+    assert "mesh_high.ply" in capsys.readouterr().err
