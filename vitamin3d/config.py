@@ -75,7 +75,7 @@ class InitializationConfig:
     min_tracks: int = 100
     min_inlier_ratio: float = 0.5
     min_triangulated_ratio: float = 0.5
-    min_surviving_ratio: float = 0.4
+    min_surviving_ratio: float = 0.12
     """Below this share of the reference's tracks, a later frame becomes the reference."""
     history: int = 90
     """Frames kept from which references are taken."""

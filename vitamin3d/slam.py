@@ -48,17 +48,16 @@ class Slam:
         with self._timed("track_extrema"):
             self.tracks = self._track(front)
         if self.state is SlamState.INITIALIZING:
+            self._refill_when_due(front)
             with self._timed("initialize"):
                 self._initialize(front)
         else:
             with self._timed("localize"):
                 T_cam_world = self._localize(front)
+            self._refill_when_due(front)
             if T_cam_world is not None:
                 with self._timed("map"):
                     self._map(front, T_cam_world)
-        if self._frame_count % self.config.extrema.refill_interval == 0:
-            with self._timed("refill"):
-                self._refill(front)
         self._frame_count += 1
         return self.state
 
@@ -72,8 +71,13 @@ class Slam:
             predicted = predict_by_dominant_flow(self.tracks.pixels, front.dominant_flow)
         return track_extrema(self.tracks, predicted, front.kappa, self.config.extrema_tracking)
 
+    def _refill_when_due(self, front: FrontEndFrame) -> None:
+        """Every few frames, free extrema become tracks."""
+        if self._frame_count % self.config.extrema.refill_interval == 0:
+            with self._timed("refill"):
+                self._refill(front)
+
     def _refill(self, front: FrontEndFrame) -> None:
-        """Free extrema become tracks."""
         new = select_free_extrema(front.extrema, self.tracks.pixels, front.kappa.shape, self.config.extrema)
         ids, zeros = np.arange(self._next_id, self._next_id + len(new)), np.zeros(len(new), np.int32)
         self._next_id += len(new)
@@ -133,6 +137,9 @@ class Slam:
             return None
         self.state = SlamState.TRACKING
         self.tracks = self.tracks.select(~np.isin(self.tracks.ids, ids[~found.is_inlier]))
+        recovery = self.config.recovery
+        if recovery.enabled and self._frame_count % recovery.interval == 0 and self._recover(front, found.T_cam_world):
+            return self._relocalize(found.T_cam_world)
         return found.T_cam_world
 
     def _recover(self, front: FrontEndFrame, T_cam_world: Array) -> int:
@@ -141,22 +148,6 @@ class Slam:
         image, recovery = front.frame.image, self.config.recovery
         self.tracks = recover_landmarks(self.tracks, self.map, image, front.kappa, T_cam_world, self.camera, recovery)
         return int((~np.isin(self.tracks.ids, before)).sum())
-
-    # --- mapping (Sec. 3) --------------------------------------------------------------------------------------
-
-    def _map(self, front: FrontEndFrame, T_cam_world: Array) -> None:
-        """Recovery, keyframes, landmarks, and bundle adjustment on every frame (Eq. 11–12)."""
-        recovery = self.config.recovery
-        if recovery.enabled and self._frame_count % recovery.interval == 0 and self._recover(front, T_cam_world):
-            T_cam_world = self._relocalize(T_cam_world)
-        if self._is_keyframe(front.frame):
-            keyframe = self._add_keyframe(front, T_cam_world)
-            triangulate_landmarks(self.map, self.camera, self.config.triangulation)
-            self._adjust_window()
-            self.poses.add(front.frame, keyframe, np.eye(4), self.map)
-        else:
-            T_cam_world = self._adjust_with_frame(T_cam_world)
-            self.poses.add_world(front.frame, T_cam_world, self.map)
 
     def _relocalize(self, T_cam_world: Array) -> Array:
         """The pose refined with the landmarks that were found again."""
@@ -168,6 +159,19 @@ class Slam:
             return T_cam_world
         self.tracks = self.tracks.select(~np.isin(self.tracks.ids, ids[~found.is_inlier]))
         return found.T_cam_world
+
+    # --- mapping (Sec. 3) --------------------------------------------------------------------------------------
+
+    def _map(self, front: FrontEndFrame, T_cam_world: Array) -> None:
+        """Keyframes, landmarks, and bundle adjustment on every frame (Eq. 11–12)."""
+        if self._is_keyframe(front.frame):
+            keyframe = self._add_keyframe(front, T_cam_world)
+            triangulate_landmarks(self.map, self.camera, self.config.triangulation)
+            self._adjust_window()
+            self.poses.add(front.frame, keyframe, np.eye(4), self.map)
+        else:
+            T_cam_world = self._adjust_with_frame(T_cam_world)
+            self.poses.add_world(front.frame, T_cam_world, self.map)
 
     def _is_keyframe(self, frame: Frame) -> bool:
         seen, pixels = self._seen()
