@@ -29,7 +29,7 @@ def _distort_normalized(points, coefficients, out):  # type: ignore[no-untyped-d
 
 @kernel
 def _undistort_normalized(points, coefficients, steps, tolerance, out):  # type: ignore[no-untyped-def]
-    """Newton's method on the distortion; NaN where it does not converge (beyond the fold of the model)."""
+    """Newton's method on the distortion; NaN beyond the fold of the model: no root, or one on the other side of the centre."""
     k1, k2, p1, p2 = coefficients
     for i in range(points.shape[0]):
         xd, yd = points[i, 0], points[i, 1]
@@ -52,7 +52,7 @@ def _undistort_normalized(points, coefficients, steps, tolerance, out):  # type:
                 break
             x -= (jyy * ex - jxy * ey) / det
             y -= (jxx * ey - jxy * ex) / det
-        if error < 1e-12:
+        if error < 1e-12 and x * xd + y * yd >= 0.0:
             out[i, 0], out[i, 1] = x, y
         else:
             out[i, 0], out[i, 1] = np.nan, np.nan

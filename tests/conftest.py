@@ -1,0 +1,35 @@
+# SPDX-License-Identifier: Apache-2.0
+"""What all tests share; its presence also puts this folder on the path (`reference`, `reference_dense`, `scenes`)."""
+
+import cv2
+import numpy as np
+import pytest
+import scenes
+from hypothesis import settings
+
+settings.register_profile("vitamin3d", max_examples=40, deadline=None, derandomize=True, database=None)
+settings.load_profile("vitamin3d")
+
+
+@pytest.fixture(autouse=True, scope="session")
+def _one_opencv_thread():
+    """OpenCV's results do not depend on it, its times do."""
+    cv2.setNumThreads(1)
+
+
+@pytest.fixture
+def rng():
+    return np.random.default_rng(20190616)
+
+
+@pytest.fixture(scope="session")
+def scene():
+    """Eight cameras, three hundred points, no noise."""
+    return scenes.arc_scene(8, 300, np.random.default_rng(1))
+
+
+@pytest.fixture(scope="session")
+def demo():
+    from vitamin3d.datasets import open_dataset
+
+    return open_dataset(scenes.DEMO)

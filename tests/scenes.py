@@ -1,0 +1,108 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Small synthetic scenes whose truth is known."""
+
+import dataclasses
+from dataclasses import dataclass
+from pathlib import Path
+
+import cv2
+import numpy as np
+
+from vitamin3d.geometry.camera import Camera
+from vitamin3d.geometry.se3 import exp_se3
+from vitamin3d.mapping.sparse_map import SparseMap
+from vitamin3d.mapping.window_selection import BundleProblem
+
+DEMO = Path(__file__).parents[1] / "data" / "demo"
+PINHOLE = Camera(520.0, 510.0, 321.5, 239.0, 640, 480)
+EUROC = Camera(458.654, 457.296, 367.215, 248.375, 752, 480, (-0.28340811, 0.07395907, 0.00019359, 1.76187114e-05))
+
+
+@dataclass(frozen=True)
+class Scene:
+    """Cameras, points and what the cameras see of them, exactly."""
+
+    camera: Camera
+    T_cam_world: np.ndarray
+    points: np.ndarray
+    obs_camera: np.ndarray
+    obs_point: np.ndarray
+    pixels: np.ndarray
+
+
+def project(camera, T_cam_world, points):
+    """Ideal pixels by the homogeneous projection matrix."""
+    homogeneous = np.column_stack([points, np.ones(len(points))]) @ (camera.K @ T_cam_world[:3]).T
+    return homogeneous[:, :2] / homogeneous[:, 2:]
+
+
+def arc_poses(count):
+    """Cameras on an arc that look at (0, 0, 6), a third of a unit apart; the first is the world."""
+    poses = []
+    for k in range(count):
+        angle = 0.06 * k
+        T_world_cam = exp_se3(np.array([0.0, 0.0, 0.0, 0.0, -angle, 0.01 * k]))
+        T_world_cam[:3, 3] = [6.0 * np.sin(angle), 0.05 * k, 6.0 - 6.0 * np.cos(angle)]
+        poses.append(np.linalg.inv(T_world_cam))
+    return np.array(poses)
+
+
+def arc_scene(num_cameras, num_points, rng, camera=PINHOLE):
+    """Each point is seen by three cameras at least; observations sorted by camera."""
+    points = rng.uniform([-2.2, -1.6, 4.0], [2.2, 1.6, 8.0], (num_points, 3))
+    poses = arc_poses(num_cameras)
+    obs = [(k, p) for k in range(num_cameras) for p in range(num_points) if (p + k) % 3 or k < 3]
+    obs_camera, obs_point = (np.array(column, np.int32) for column in zip(*obs, strict=True))
+    pixels = np.array([project(camera, poses[c], points[p : p + 1])[0] for c, p in obs])
+    return Scene(camera, poses, points, obs_camera, obs_point, pixels)
+
+
+def with_noise(scene, rng, sigma_px=0.5, outlier_share=0.03):
+    """The scene with noisy pixels, some of them far off; and which are (M,) outliers."""
+    pixels = scene.pixels + sigma_px * rng.standard_normal(scene.pixels.shape)
+    is_outlier = rng.random(len(pixels)) < outlier_share
+    pixels[is_outlier] += rng.uniform(20, 60, (is_outlier.sum(), 2)) * rng.choice([-1, 1], (is_outlier.sum(), 2))
+    return dataclasses.replace(scene, pixels=pixels), is_outlier
+
+
+def problem_of(scene, num_fixed=1, poses=None, points=None):
+    """The adjustment of all of a scene, the first `num_fixed` cameras fixed."""
+    poses, points = scene.T_cam_world if poses is None else poses, scene.points if points is None else points
+    order = np.argsort(scene.obs_point, kind="stable")
+    starts = np.searchsorted(scene.obs_point[order], np.arange(len(points) + 1))
+    rows, ids = np.arange(len(scene.pixels)), np.arange(len(points))
+    is_free = np.arange(len(poses)) >= num_fixed
+    return BundleProblem(poses, is_free, points, scene.obs_camera, scene.obs_point, scene.pixels, starts, order, ids, rows)
+
+
+def perturbed(scene, rng, pose=0.02, point=0.05):
+    """Poses (all but the first) and points near the truth."""
+    poses = [exp_se3(pose * rng.standard_normal(6)) @ T if k else T for k, T in enumerate(scene.T_cam_world)]
+    return np.array(poses), scene.points + point * rng.standard_normal(scene.points.shape)
+
+
+def map_of(scene, with_points=True):
+    """The scene as a SparseMap, landmark ids 0..P-1; frame 10 k is keyframe k."""
+    sparse_map = SparseMap()
+    for k, T in enumerate(scene.T_cam_world):
+        mine = scene.obs_camera == k
+        count = int(mine.sum())
+        colors, patches = np.full((count, 3), k, np.uint8), np.full((count, 81), k, np.uint8)
+        sparse_map.add_keyframe(10 * k, 10**9 * k, T, scene.obs_point[mine].astype(np.int64), scene.pixels[mine], colors, patches)
+    if with_points:
+        sparse_map.points_world[:] = scene.points
+    return sparse_map
+
+
+def texture(height, width, rng, sigma=3.0):
+    """A picture (H, W) uint8 with blobs of a size and of four times that size."""
+    fine = cv2.GaussianBlur(rng.standard_normal((height, width)), (0, 0), sigma)
+    coarse = cv2.GaussianBlur(rng.standard_normal((height, width)), (0, 0), 4 * sigma)
+    mixed = fine / fine.std() + coarse / coarse.std()
+    return np.clip(128 + 35 * mixed, 0, 255).astype(np.uint8)
+
+
+def warped(image, A, b):
+    """The picture after the motion y = A x + b."""
+    size = (image.shape[1], image.shape[0])
+    return cv2.warpAffine(image, np.column_stack([A, b]), size, flags=cv2.INTER_CUBIC, borderMode=cv2.BORDER_REFLECT)
