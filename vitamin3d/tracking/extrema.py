@@ -18,7 +18,7 @@ def _local_maxima(kappa, floor, border, out):  # type: ignore[no-untyped-def]
     for v in range(border, height - border):
         for u in range(border, width - border):
             k = kappa[v, u]
-            if k <= floor or k <= kappa[v, u - 1] or k < kappa[v, u + 1]:
+            if not k > floor or k <= kappa[v, u - 1] or k < kappa[v, u + 1]:
                 continue
             if k <= kappa[v - 1, u - 1] or k <= kappa[v - 1, u] or k <= kappa[v - 1, u + 1]:
                 continue

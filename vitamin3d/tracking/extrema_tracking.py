@@ -40,7 +40,7 @@ def _climb_all(kappa, predicted, weight, sigma, max_steps, gate, out, out_kappa,
         if not (u >= 1 and v >= 1 and u < width - 1 and v < height - 1):
             continue
         u, v, is_maximum = climb(kappa, u, v, pu, pv, weight, sigma * sigma, max_steps)
-        if not is_maximum or kappa[v, u] <= 0.0:
+        if not is_maximum or not kappa[v, u] > 0.0:
             continue
         x = u + subpixel_offset(kappa[v, u - 1], kappa[v, u], kappa[v, u + 1])
         y = v + subpixel_offset(kappa[v - 1, u], kappa[v, u], kappa[v + 1, u])

@@ -1,0 +1,165 @@
+# SPDX-License-Identifier: Apache-2.0
+import dataclasses
+
+import numpy as np
+import pytest
+import reference
+from scenes import texture, warped
+from scipy.spatial.transform import Rotation
+
+from vitamin3d.config import CurvatureConfig, ExtremaConfig, ExtremaTrackingConfig
+from vitamin3d.tracking.curvature import curvature
+from vitamin3d.tracking.extrema import detect_extrema, refine_extrema
+from vitamin3d.tracking.extrema_tracking import (
+    _climb_all,
+    merge_meeting_tracks,
+    predict_by_dense_flow,
+    predict_by_dominant_flow,
+    track_extrema,
+)
+from vitamin3d.types import DominantFlow, Tracks
+
+CONFIG = ExtremaTrackingConfig()
+
+
+def tracks_at(pixels, ids=None, ages=None, missed=None):
+    n = len(pixels)
+    filled = (np.zeros(n, np.int32) if values is None else np.array(values, np.int32) for values in (ages, missed))
+    return Tracks(np.arange(n) if ids is None else np.array(ids), np.array(pixels, float), np.ones(n, np.float32), *filled)
+
+
+def climbed(kappa, predicted, config):
+    n = len(predicted)
+    out, values, found = np.empty((n, 2)), np.empty(n, np.float32), np.empty(n, np.bool_)
+    weight, sigma = config.prediction_weight, config.prediction_sigma_px
+    _climb_all(kappa, predicted, weight, sigma, config.max_steps, config.gate_px, out, values, found)
+    return out, values, found
+
+
+@pytest.mark.parametrize("shape", [(3, 3), (3, 30), (25, 31)])
+@pytest.mark.parametrize("config", [CONFIG, dataclasses.replace(CONFIG, gate_px=8.0, max_steps=2, prediction_weight=2.0)])
+def test_climbing_equals_its_twin(rng, shape, config):
+    kappa = rng.standard_normal(shape).astype(np.float32)
+    predicted = rng.uniform(-2, [shape[1] + 1, shape[0] + 1], (200, 2))
+    out, values, found = climbed(kappa, predicted, config)
+    for i, p in enumerate(predicted):
+        twin = reference.climbed(kappa, p, config.prediction_weight, config.prediction_sigma_px, config.max_steps, config.gate_px)
+        assert found[i] == (twin is not None), (p, twin)
+        np.testing.assert_allclose(out[i], p if twin is None else twin, atol=1e-4)
+        assert (values[i] > 0) == found[i]
+    assert not found.all() and (found.any() or shape == (3, 3))
+
+
+def test_the_prediction_pulls_at_an_even_ridge():
+    kappa = np.zeros((21, 41), np.float32)
+    kappa[10] = 1.0
+    out, _, found = climbed(kappa, np.array([[17.0, 10.0], [30.2, 10.0]]), CONFIG)
+    assert found.all()
+    np.testing.assert_allclose(out, [[17, 10], [30, 10]], atol=0.5)
+
+
+def test_nan_curvature_is_never_found(rng):
+    kappa = np.full((20, 20), np.nan, np.float32)
+    _, _, found = climbed(kappa, rng.uniform(3, 17, (20, 2)), CONFIG)
+    assert not found.any()
+
+
+def test_flow_samples_equal_their_twin(rng):
+    flow = rng.standard_normal((7, 9, 2)).astype(np.float32)
+    pixels = np.concatenate([rng.uniform(-2, [11, 9], (40, 2)), [[0, 0], [8, 6], [3, 2]]])
+    expected = [p + reference.bilinear(flow.astype(float), *p) for p in pixels]
+    np.testing.assert_allclose(predict_by_dense_flow(pixels, flow), expected, atol=1e-2)
+    interior = pixels[((pixels > 0) & (pixels < [7.9, 5.9])).all(axis=1)]
+    expected = [p + reference.bilinear(flow.astype(float), *p) for p in interior]
+    np.testing.assert_allclose(predict_by_dense_flow(interior, flow), expected, atol=1e-6)
+    assert predict_by_dense_flow(pixels[:0], flow).shape == (0, 2)
+
+
+def test_dominant_flow_prediction_is_equation_4():
+    flow = DominantFlow(np.array([[1.0, 0.5], [0.0, 2.0]]), np.array([10.0, -1.0]), 1.0)
+    np.testing.assert_allclose(predict_by_dominant_flow(np.array([[2.0, 4.0]]), flow), [[14.0, 7.0]])
+
+
+@pytest.fixture(scope="module")
+def moving():
+    """Two pictures by a known warp, the extrema of the first and where they must be in the second."""
+    rng = np.random.default_rng(8)
+    A = 1.005 * Rotation.from_euler("z", 0.8, degrees=True).as_matrix()[:2, :2]
+    b = np.array([2.7, -3.4])
+    image = texture(240, 320, rng, 4.0)
+    kappa_0, kappa_1 = (curvature(x, CurvatureConfig()) for x in (image, warped(image, A, b)))
+    pixels = refine_extrema(kappa_0, detect_extrema(kappa_0, ExtremaConfig(border_px=20, min_curvature=2.0)))
+    return pixels, pixels @ A.T + b, kappa_1
+
+
+def test_extrema_are_followed_through_a_known_warp(moving, rng):
+    pixels, truth, kappa = moving
+    predicted = truth + rng.uniform(-0.35, 0.35, truth.shape)
+    found = track_extrema(tracks_at(pixels), predicted, kappa, CONFIG)
+    assert len(pixels) > 100
+    seen = found.select(found.missed == 0)
+    near = np.linalg.norm(seen.pixels - truth[seen.ids], axis=1) < 0.5
+    assert near.sum() >= 0.9 * len(pixels)
+    assert np.median(np.linalg.norm(seen.pixels - truth[seen.ids], axis=1)) < 0.15
+    assert (seen.ages == 1).all() and (seen.kappa > 0).all()
+
+
+def test_a_wrong_prediction_is_a_miss_not_a_jump(moving):
+    pixels, truth, kappa = moving
+    found = track_extrema(tracks_at(pixels), truth + [0.0, 6.0], kappa, CONFIG)
+    seen = found.select(found.missed == 0)
+    assert (np.linalg.norm(seen.pixels - truth[seen.ids] - [0.0, 6.0], axis=1) <= CONFIG.gate_px).all()
+    assert len(seen) < 0.6 * len(pixels)
+
+
+def test_a_track_coasts_one_frame_and_is_then_dropped():
+    flat = np.zeros((40, 40), np.float32)
+    start = tracks_at([[20.0, 20.0]], ids=[7], ages=[5])
+    coasting = track_extrema(start, np.array([[21.0, 19.0]]), flat, CONFIG)
+    assert (coasting.ids[0], coasting.missed[0], coasting.ages[0]) == (7, 1, 6)
+    np.testing.assert_array_equal(coasting.pixels, [[21.0, 19.0]])
+    assert coasting.kappa[0] == start.kappa[0]
+    assert len(track_extrema(coasting, np.array([[22.0, 18.0]]), flat, CONFIG)) == 0
+    assert len(track_extrema(start, np.array([[21.0, 19.0]]), flat, dataclasses.replace(CONFIG, coast_frames=0))) == 0
+
+
+def test_a_coasting_track_that_is_seen_again_counts_from_zero():
+    kappa = np.zeros((40, 40), np.float32)
+    kappa[20, 21] = 5.0
+    found = track_extrema(tracks_at([[20.0, 20.0]], missed=[1]), np.array([[20.6, 20.2]]), kappa, CONFIG)
+    assert found.missed[0] == 0 and found.kappa[0] == 5.0
+    np.testing.assert_allclose(found.pixels, [[21.0, 20.0]])
+
+
+def test_tracks_that_leave_the_picture_end():
+    kappa = np.zeros((40, 50), np.float32)
+    predicted = np.array([[-1.0, 20.0], [25.0, 41.0], [0.5, 20.0], [25.0, 20.0], [48.5, 5.0]])
+    found = track_extrema(tracks_at(np.full((5, 2), 20.0)), predicted, kappa, CONFIG)
+    assert found.ids.tolist() == [3]
+
+
+def test_tracks_that_meet_are_merged_into_the_oldest():
+    kappa = np.zeros((40, 40), np.float32)
+    kappa[20, 20] = 5.0
+    predicted = np.array([[20.4, 20.0], [19.7, 20.3], [20.0, 19.6]])
+    found = track_extrema(tracks_at(predicted, ids=[4, 9, 2], ages=[3, 8, 3]), predicted, kappa, CONFIG)
+    assert found.ids.tolist() == [9] and found.ages.tolist() == [9]
+
+
+@pytest.mark.parametrize(
+    ("ids", "ages", "missed", "winner"), [([4, 9], [3, 8], [0, 1], 4), ([4, 9], [3, 8], [0, 0], 9), ([9, 4], [3, 3], [0, 0], 4)]
+)
+def test_a_seen_track_wins_then_the_oldest_then_the_first(ids, ages, missed, winner):
+    merged = merge_meeting_tracks(tracks_at([[5.1, 6.0], [4.9, 6.2]], ids, ages, missed), 40)
+    assert merged.ids.tolist() == [winner]
+
+
+def test_merging_keeps_the_order_and_all_that_do_not_meet(rng):
+    pixels = rng.permutation(np.array([(u, v) for u in range(20) for v in range(15)], float))
+    merged = merge_meeting_tracks(tracks_at(pixels), 20)
+    np.testing.assert_array_equal(merged.ids, np.arange(300))
+
+
+def test_no_tracks():
+    empty = track_extrema(Tracks.empty(), np.zeros((0, 2)), np.zeros((9, 9), np.float32), CONFIG)
+    assert len(empty) == 0 and empty.pixels.shape == (0, 2)
