@@ -106,7 +106,7 @@ def test_extrema_are_followed_through_a_known_warp(moving, rng):
 
 def test_a_wrong_prediction_is_a_miss_not_a_jump(moving):
     pixels, truth, kappa = moving
-    found = track_extrema(tracks_at(pixels), truth + [0.0, 6.0], kappa, CONFIG)
+    found = track_extrema(tracks_at(pixels), truth + np.array([0.0, 6.0]), kappa, CONFIG)
     seen = found.select(found.missed == 0)
     assert (np.linalg.norm(seen.pixels - truth[seen.ids] - [0.0, 6.0], axis=1) <= CONFIG.gate_px).all()
     assert len(seen) < 0.6 * len(pixels)

@@ -17,6 +17,6 @@ def is_keyframe(pixels_keyframe: Array, pixels_now: Array, num_keyframe_landmark
     """
     if gap < config.min_gap:
         return False
-    if len(pixels_now) < config.min_tracked_ratio * num_keyframe_landmarks:
+    if len(pixels_now) == 0 or len(pixels_now) < config.min_tracked_ratio * num_keyframe_landmarks:
         return True
     return bool(np.median(np.linalg.norm(pixels_now - pixels_keyframe, axis=1)) >= config.motion_px)

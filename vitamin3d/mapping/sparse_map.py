@@ -172,6 +172,7 @@ class SparseMap:
         observations = observations[self.obs_valid[observations]]
         self.obs_valid[observations] = False
         ids = self.obs_landmark[observations]
+        ids = ids[(self.num_observations[ids] > 0) & (observations >= self.first_observation[ids])]
         np.subtract.at(self._count.view, ids, 1)
         self.remove_landmarks(np.unique(ids[self.num_observations[ids] < 2]))
 

@@ -1,0 +1,198 @@
+# SPDX-License-Identifier: Apache-2.0
+import numpy as np
+import reference
+from scenes import map_of
+
+from vitamin3d.config import KeyframeConfig
+from vitamin3d.geometry.se3 import exp_se3, inverse
+from vitamin3d.mapping.keyframe_selection import is_keyframe
+from vitamin3d.mapping.pose_log import PoseLog
+from vitamin3d.mapping.sparse_map import SparseMap
+from vitamin3d.types import Frame
+
+
+def add(sparse_map, ids, seed=0, T=None):
+    rng, n, k = np.random.default_rng(seed), len(ids), sparse_map.num_keyframes
+    pixels, colors = rng.uniform(0, 400, (n, 2)), rng.integers(0, 255, (n, 3), np.uint8)
+    patches = rng.integers(0, 255, (n, 81), np.uint8)
+    sparse_map.add_keyframe(10 * k, 10**9 * k, np.eye(4) if T is None else T, np.array(ids, np.int64), pixels, colors, patches)
+    return pixels, colors, patches
+
+
+def check_counts(sparse_map):
+    """Counts, first and last agree with what the observations say."""
+    for id_ in range(len(sparse_map.points_world)):
+        rows = reference.counting_observations(sparse_map, id_)
+        assert sparse_map.num_observations[id_] == (len(rows) if sparse_map.first_observation[id_] >= 0 else 0), id_
+
+
+def test_observations_are_stored_by_keyframe():
+    sparse_map = SparseMap()
+    pixels_0, *_ = add(sparse_map, [3, 0])
+    pixels_1, colors_1, patches_1 = add(sparse_map, [0, 5, 3], 1)
+    assert (sparse_map.num_keyframes, sparse_map.keyframe_starts) == (2, [0, 2, 5])
+    assert (sparse_map.frame_indices, sparse_map.timestamps_ns) == ([0, 10], [0, 10**9])
+    np.testing.assert_array_equal(sparse_map.obs_landmark, [3, 0, 0, 5, 3])
+    np.testing.assert_array_equal(sparse_map.obs_pixels, np.vstack([pixels_0, pixels_1]))
+    np.testing.assert_array_equal(sparse_map.obs_keyframe, [0, 0, 1, 1, 1])
+    np.testing.assert_array_equal(sparse_map.obs_pixels[sparse_map.observations_of(1)], pixels_1)
+    np.testing.assert_array_equal(sparse_map.num_observations, [2, 0, 0, 2, 0, 1])
+    np.testing.assert_array_equal(sparse_map.first_observation, [1, -1, -1, 0, -1, 3])
+    np.testing.assert_array_equal(sparse_map.last_observation, [2, -1, -1, 4, -1, 3])
+    np.testing.assert_array_equal(sparse_map.colors[[0, 5, 3]], colors_1)
+    np.testing.assert_array_equal(sparse_map.patches[[0, 5, 3]], patches_1)
+    check_counts(sparse_map)
+
+
+def test_keyframe_of_is_the_keyframe_of_each_observation():
+    sparse_map = SparseMap()
+    for ids in ([0, 1], [], [2], [0, 1, 2]):
+        add(sparse_map, ids)
+    np.testing.assert_array_equal(sparse_map.keyframe_of(np.arange(6)), sparse_map.obs_keyframe)
+    np.testing.assert_array_equal(sparse_map.obs_keyframe, [0, 0, 2, 3, 3, 3])
+
+
+def test_a_track_is_mapped_once_it_has_a_point():
+    sparse_map = SparseMap()
+    add(sparse_map, [0, 1, 2])
+    np.testing.assert_array_equal(sparse_map.is_mapped(np.array([0, 1, 2, 3, 9999])), False)
+    sparse_map.points_world[1] = [1, 2, 3]
+    np.testing.assert_array_equal(sparse_map.is_mapped(np.array([2, 1, 9999])), [False, True, False])
+    assert sparse_map.is_mapped(np.zeros(0, np.int64)).shape == (0,)
+
+
+def test_it_grows_beyond_its_first_size():
+    sparse_map = SparseMap()
+    pixels = [add(sparse_map, range(700 * k, 700 * k + 900), k)[0] for k in range(5)]
+    assert len(sparse_map.obs_pixels) == 4500 and len(sparse_map.points_world) == 3700
+    np.testing.assert_array_equal(sparse_map.obs_pixels, np.vstack(pixels))
+    assert np.isnan(sparse_map.points_world).all() and sparse_map.obs_valid.all()
+    sparse_map.points_world[3699] = 1.0
+    for k in range(1200):
+        add(sparse_map, [5000], k, exp_se3(np.full(6, 1e-3 * k)))
+    assert sparse_map.T_cam_world.shape == (1205, 4, 4)
+    np.testing.assert_allclose(sparse_map.T_cam_world[1204], exp_se3(np.full(6, 1.199)))
+    assert sparse_map.points_world[3699, 0] == 1.0 and sparse_map.num_observations[5000] == 1200
+    assert np.isnan(sparse_map.points_world[3700:]).all() and (sparse_map.first_observation[3700:5000] == -1).all()
+
+
+def test_removed_observations_leave_the_counts():
+    sparse_map = SparseMap()
+    for _ in range(4):
+        add(sparse_map, [0, 1])
+    sparse_map.points_world[:] = 1.0
+    sparse_map.remove_observations(np.array([0, 2]))
+    np.testing.assert_array_equal(sparse_map.num_observations, [2, 4])
+    sparse_map.remove_observations(np.array([0, 2]))  # once more changes nothing
+    np.testing.assert_array_equal(sparse_map.num_observations, [2, 4])
+    np.testing.assert_array_equal(sparse_map.is_mapped(np.arange(2)), [True, True])
+    check_counts(sparse_map)
+    sparse_map.remove_observations(np.array([4]))  # one is left
+    np.testing.assert_array_equal(sparse_map.is_mapped(np.arange(2)), [False, True])
+    np.testing.assert_array_equal(sparse_map.num_observations, [0, 4])
+    check_counts(sparse_map)
+    sparse_map.remove_observations(np.zeros(0, np.int64))
+    np.testing.assert_array_equal(sparse_map.num_observations, [0, 4])
+
+
+def test_observations_before_a_removal_count_no_more():
+    sparse_map = SparseMap()
+    for _ in range(3):
+        add(sparse_map, [0, 1])
+    sparse_map.points_world[:] = 1.0
+    sparse_map.remove_landmarks(np.array([0]))
+    assert sparse_map.first_observation[0] == -1 and sparse_map.num_observations[0] == 0
+    add(sparse_map, [0, 1])
+    add(sparse_map, [0, 1])
+    np.testing.assert_array_equal(sparse_map.num_observations, [2, 5])
+    np.testing.assert_array_equal(sparse_map.first_observation, [6, 1])
+    assert reference.counting_observations(sparse_map, 0) == [(6, 3), (8, 4)]
+    check_counts(sparse_map)
+
+
+def test_removing_an_old_observation_of_a_restarted_track_leaves_its_count():
+    sparse_map = SparseMap()
+    for _ in range(3):
+        add(sparse_map, [0])
+    sparse_map.remove_landmarks(np.array([0]))
+    for _ in range(3):
+        add(sparse_map, [0])
+    sparse_map.points_world[0] = 1.0
+    sparse_map.remove_observations(np.array([0, 1]))
+    assert sparse_map.num_observations[0] == 3 and sparse_map.is_mapped(np.array([0]))[0]
+    check_counts(sparse_map)
+
+
+def test_a_cloned_pose_is_a_copy(scene):
+    sparse_map = map_of(scene)
+    pose = sparse_map.clone_pose(2)
+    np.testing.assert_array_equal(pose, scene.T_cam_world[2])
+    pose[:] = 0
+    assert sparse_map.T_cam_world[2].any()
+
+
+# --- keyframe selection ------------------------------------------------------------------------------------------
+
+
+def test_a_frame_becomes_a_keyframe_by_motion_or_by_loss():
+    config, still = KeyframeConfig(motion_px=12.0, min_tracked_ratio=0.6, min_gap=2), np.zeros((100, 2))
+    assert not is_keyframe(still, still + np.array([8.0, 8.0]), 100, 5, config)
+    assert is_keyframe(still, still + np.array([8.0, 9.0]), 100, 5, config)
+    assert not is_keyframe(still[:60], still[:60], 100, 5, config)
+    assert is_keyframe(still[:59], still[:59], 100, 5, config)
+    assert is_keyframe(still[:0], still[:0], 100, 5, config)
+    assert not is_keyframe(still[:0], still[:0], 100, 1, config)
+
+
+def test_a_keyframe_without_landmarks_asks_for_the_next():
+    none = np.zeros((0, 2))
+    assert is_keyframe(none, none, 0, 1, KeyframeConfig())
+
+
+# --- poses of all frames -----------------------------------------------------------------------------------------
+
+NO_PICTURE = np.zeros((1, 1), np.uint8)
+
+
+def logged(scene):
+    """Keyframes 0, 10, 20 ... and, between them, frames 11 and 12."""
+    sparse_map, log = map_of(scene), PoseLog()
+    for k in range(8):
+        log.add(Frame(10 * k, 10**9 * k, NO_PICTURE), k, np.eye(4), sparse_map)
+    between = exp_se3(np.array([0.1, 0, 0, 0, 0.02, 0])) @ scene.T_cam_world[1]
+    log.add_world(Frame(11, 11 * 10**8, NO_PICTURE), between, sparse_map)
+    return sparse_map, log, between
+
+
+def test_frames_move_with_their_keyframe(scene):
+    sparse_map, log, between = logged(scene)
+    np.testing.assert_allclose(log.pose(11, sparse_map), between, atol=1e-14)
+    moved = exp_se3(np.array([0.5, 0.1, -0.2, 0.1, 0, 0]))
+    sparse_map.T_cam_world[1] = sparse_map.T_cam_world[1] @ moved
+    np.testing.assert_allclose(log.pose(11, sparse_map), between @ moved, atol=1e-14)
+    np.testing.assert_allclose(log.pose(20, sparse_map), scene.T_cam_world[2], atol=1e-14)
+
+
+def test_the_trajectory_is_camera_to_world_by_time(scene):
+    sparse_map, log, between = logged(scene)
+    trajectory = log.trajectory(sparse_map)
+    assert len(log) == len(trajectory) == 9
+    assert (np.diff(trajectory.timestamps_ns) > 0).all() and trajectory.timestamps_ns[2] == 11 * 10**8
+    np.testing.assert_allclose(trajectory.T_world_cam[2], inverse(between), atol=1e-13)
+    assert PoseLog().trajectory(sparse_map).T_world_cam.shape == (0, 4, 4)
+
+
+def test_prediction_goes_on_as_before(scene):
+    sparse_map, log = map_of(scene), PoseLog()
+    step = exp_se3(np.array([0.1, 0, 0.05, 0, 0.02, 0.01]))
+    log.add_world(Frame(30, 0, NO_PICTURE), scene.T_cam_world[3], sparse_map)
+    np.testing.assert_allclose(log.predict(sparse_map), scene.T_cam_world[3], atol=1e-13)
+    log.add_world(Frame(31, 1, NO_PICTURE), step @ scene.T_cam_world[3], sparse_map)
+    np.testing.assert_allclose(log.predict(sparse_map), step @ step @ scene.T_cam_world[3], atol=1e-12)
+
+
+def test_prediction_stands_still_after_a_gap(scene):
+    sparse_map, log = map_of(scene), PoseLog()
+    log.add_world(Frame(30, 0, NO_PICTURE), scene.T_cam_world[3], sparse_map)
+    log.add_world(Frame(35, 1, NO_PICTURE), scene.T_cam_world[4], sparse_map)
+    np.testing.assert_allclose(log.predict(sparse_map), scene.T_cam_world[4], atol=1e-13)
