@@ -5,7 +5,7 @@ import os
 import sys
 from enum import Enum
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
@@ -97,7 +97,7 @@ def _named(mode: Mode) -> "Config":
     return paper_config() if mode is Mode.paper else Config()
 
 
-def _voxels(low: float | None, high: float | None, metric_scale: float | None, from_truth: bool) -> dict[str, float]:
+def _voxels(low: float | None, high: float | None, metric_scale: float | None, from_truth: bool) -> dict[str, Any]:
     """The given voxel sizes in metres; InputError where they or the scale make no sense."""
     given = {name: value for name, value in (("voxel_low", low), ("voxel_high", high)) if value is not None}
     if metric_scale is not None and from_truth:
@@ -110,7 +110,7 @@ def _voxels(low: float | None, high: float | None, metric_scale: float | None, f
     return given
 
 
-def _settings(mode: Mode, path: Path | None, seed: int | None, voxels: dict[str, float]) -> "Config":
+def _settings(mode: Mode, path: Path | None, seed: int | None, voxels: dict[str, Any]) -> "Config":
     import dataclasses
 
     from vitamin3d.config import load_toml

@@ -128,10 +128,10 @@ class RecoveryConfig:
 
 @dataclass(frozen=True)
 class WindowConfig:
-    keyframes: int = 12
-    anchors: int = 15
+    keyframes: int = 20
+    anchors: int = 60
     """Older keyframes, poses fixed, that share most landmarks with the window."""
-    min_shared_landmarks: int = 40
+    min_shared_landmarks: int = 20
 
 
 @dataclass(frozen=True)
@@ -169,8 +169,9 @@ class DelaunayConfig:
     min_separation_px: float = 1.0
     """Of two landmarks nearer than this in the image, the more certain one becomes a vertex."""
     weight_scale: float = 0.02
-    """Data weight of a vertex = weight_scale / relative deviation of its depth, at most max_weight."""
-    max_weight: float = 20.0
+    """Data weight of a vertex = weight_scale / relative deviation of its depth."""
+    deviation_floor: float = 0.007
+    """Relative, added in quadrature: what landmarks share (poses, calibration) and mismatches are not in their deviations."""
 
 
 @dataclass(frozen=True)
@@ -179,7 +180,7 @@ class NltgvConfig:
 
     enabled: bool = True
     iterations: int = 400
-    data_weight: float = 2.0
+    data_weight: float = 1.5
     """lambda."""
     slope_weight: float = 1.0
     """beta."""
@@ -283,7 +284,8 @@ def load_toml(path: Path, base: Config | None = None) -> Config:
         table = tomllib.loads(path.read_text())
     except (OSError, UnicodeDecodeError, tomllib.TOMLDecodeError) as error:
         raise InputError(f"{path}: not a readable TOML file ({error}); see `vitamin3d config` for the format") from None
-    return _replaced(base or Config(), table, path, "")
+    config: Config = _replaced(base or Config(), table, path, "")
+    return config
 
 
 def _replaced(node: Any, table: dict[str, Any], path: Path, prefix: str) -> Any:

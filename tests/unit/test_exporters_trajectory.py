@@ -8,10 +8,12 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from vitamin3d.datasets.tables import nanoseconds_from_seconds, seconds_from_nanoseconds
+from vitamin3d.datasets.tables import nanoseconds_from_seconds
+from vitamin3d.datasets.trajectories import read_tum
 from vitamin3d.errors import InputError, OutputError
-from vitamin3d.exporters.trajectory import read_tum, write_tum
+from vitamin3d.exporters.trajectory import write_tum
 from vitamin3d.geometry.se3 import exp_se3
+from vitamin3d.timestamps import seconds_from_nanoseconds
 from vitamin3d.types import Trajectory
 
 

@@ -9,8 +9,7 @@ from math import isfinite
 from pathlib import Path
 
 from vitamin3d.errors import InputError
-
-NANOSECONDS = 10**9
+from vitamin3d.timestamps import NANOSECONDS, seconds_from_nanoseconds
 
 
 @dataclass(frozen=True)
@@ -67,12 +66,6 @@ def nanoseconds_from_seconds(text: str) -> int:
     if abs(value) >= 2**63:
         raise ValueError(text)
     return value
-
-
-def seconds_from_nanoseconds(timestamp_ns: int) -> str:
-    """Decimal seconds with nine decimals, exactly."""
-    seconds, rest = divmod(abs(timestamp_ns), NANOSECONDS)
-    return f"{'-' if timestamp_ns < 0 else ''}{seconds}.{rest:09d}"
 
 
 def row_seconds(row: Row) -> int:

@@ -24,7 +24,7 @@ def triangulate(snapshot: MapSnapshot, config: DelaunayConfig) -> ImageMesh | No
         triangles = Delaunay(pixels).simplices.astype(np.int32)
     except QhullError:
         return None
-    weight = np.minimum(config.max_weight, config.weight_scale / np.maximum(snapshot.relative_deviations[chosen], 1e-12))
+    weight = config.weight_scale / np.hypot(snapshot.relative_deviations[chosen], config.deviation_floor)
     return ImageMesh(pixels, triangles, unique_edges(triangles), 1.0 / snapshot.depths[chosen], weight)
 
 

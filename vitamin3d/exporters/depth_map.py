@@ -7,7 +7,7 @@ import cv2
 import numpy as np
 
 from vitamin3d.errors import InputError, OutputError
-from vitamin3d.exporters.mesh import write_file
+from vitamin3d.exporters.files import write_file
 from vitamin3d.types import Array
 
 MAX_COUNT = 65535

@@ -1,13 +1,13 @@
 # SPDX-License-Identifier: Apache-2.0
 """Surfaces and clouds as PLY (binary) and OBJ (text), each file complete or absent."""
 
-import os
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterator
 from pathlib import Path
 
 import numpy as np
 
-from vitamin3d.errors import InputError, OutputError
+from vitamin3d.errors import InputError
+from vitamin3d.exporters.files import write_file
 from vitamin3d.types import Array, PointCloud, Surface
 
 POSITION, NORMAL, COLOR = ("x", "y", "z"), ("nx", "ny", "nz"), ("red", "green", "blue")
@@ -91,31 +91,6 @@ def _element_count(lines: list[str], name: str) -> int:
     """Number of elements that a header declares; 0 where it declares none."""
     words = next((line.split() for line in lines if line.startswith(f"element {name} ")), [])
     return int(words[2]) if len(words) == 3 and words[2].isdigit() else 0
-
-
-def write_file(path: Path, parts: Iterable[bytes]) -> None:
-    """Writes the parts to a temporary name in the same folder, then renames: `path` is complete or as it was.
-
-    Raises:
-        OutputError: the disk is full, or the folder is missing or not writable.
-    """
-    temporary = path.with_name(f".{path.name}.{os.getpid()}.tmp")
-    try:
-        with temporary.open("wb") as file:
-            for part in parts:
-                file.write(part)
-        temporary.replace(path)
-    except OSError as error:
-        raise OutputError(f"{path}: cannot be written ({error.strerror}); free the disk or choose another --out") from None
-    finally:
-        _remove(temporary)
-
-
-def _remove(temporary: Path) -> None:
-    try:
-        temporary.unlink(missing_ok=True)
-    except OSError:
-        return  # the folder itself is out of reach: nothing was written
 
 
 def _fill(table: Array, names: tuple[str, ...], columns: Array) -> None:

@@ -57,21 +57,40 @@ class NormalCaster:
 
     def cast(self, camera: Camera, T_cam_world: Array) -> Array:
         """Normals (H, W, 3) float32; see `cast_normal_map`."""
-        import open3d as o3d
-
-        hits = self._scene.cast_rays(o3d.core.Tensor(_rays_world(camera, T_cam_world)))
-        hit = np.isfinite(hits["t_hit"].numpy())
+        hit, corners, uv, _ = self._hits(camera, T_cam_world)
         normals = np.zeros((camera.height, camera.width, 3), np.float32)
-        corners = self._surface.triangles[hits["primitive_ids"].numpy()[hit]]
-        seen = self._interpolated(corners, hits["primitive_uvs"].numpy()[hit]) @ T_cam_world[:3, :3].T
+        mixed = _interpolated(self._surface.normals_world, corners, uv)
+        seen = mixed / np.maximum(np.linalg.norm(mixed, axis=1, keepdims=True), 1e-12) @ T_cam_world[:3, :3].T
         normals[hit] = seen * _towards_camera(seen, camera, hit)[:, None]
         return normals
 
-    def _interpolated(self, corners: Array, uv: Array) -> Array:
-        """Unit normals (N, 3) at the barycentric `uv` (N, 2) of triangles (N, 3)."""
-        a, b, c = (self._surface.normals_world[corners[:, k]] for k in range(3))
-        mixed = (1.0 - uv.sum(axis=1, keepdims=True)) * a + uv[:, :1] * b + uv[:, 1:] * c
-        return np.asarray(mixed / np.maximum(np.linalg.norm(mixed, axis=1, keepdims=True), 1e-12))
+    def cast_colors(self, camera: Camera, T_cam_world: Array) -> Array:
+        """Vertex colours (H, W, 3) float32, 0–255, interpolated; 0 where the mesh is not."""
+        hit, corners, uv, _ = self._hits(camera, T_cam_world)
+        colors = np.zeros((camera.height, camera.width, 3), np.float32)
+        colors[hit] = _interpolated(self._surface.colors.astype(np.float32), corners, uv)
+        return colors
+
+    def median_depth(self, camera: Camera, T_cam_world: Array) -> float:
+        """Median depth along z of what the camera sees of the mesh; 1 where it sees nothing."""
+        *_, depths = self._hits(camera, T_cam_world)
+        return float(np.median(depths)) if len(depths) else 1.0
+
+    def _hits(self, camera: Camera, T_cam_world: Array) -> tuple[Array, Array, Array, Array]:
+        """Which pixels (H, W) hit; per hit the triangle's corners (N, 3), barycentric uv (N, 2) and depth along z (N,)."""
+        import open3d as o3d
+
+        hits = self._scene.cast_rays(o3d.core.Tensor(_rays_world(camera, T_cam_world)))
+        depth = hits["t_hit"].numpy()
+        hit = np.isfinite(depth)
+        corners = self._surface.triangles[hits["primitive_ids"].numpy()[hit]]
+        return hit, corners, hits["primitive_uvs"].numpy()[hit], depth[hit]
+
+
+def _interpolated(values: Array, corners: Array, uv: Array) -> Array:
+    """Values (N, C) at the barycentric `uv` (N, 2) of triangles (N, 3)."""
+    a, b, c = (values[corners[:, k]] for k in range(3))
+    return np.asarray((1.0 - uv.sum(axis=1, keepdims=True)) * a + uv[:, :1] * b + uv[:, 1:] * c)
 
 
 def _rays_world(camera: Camera, T_cam_world: Array) -> Array:

@@ -12,11 +12,13 @@ import numpy as np
 from vitamin3d.config import Config, dump_toml
 from vitamin3d.errors import OutputError
 from vitamin3d.exporters.depth_map import write_depth_map
-from vitamin3d.exporters.mesh import write_cloud_ply, write_file, write_obj, write_ply
+from vitamin3d.exporters.files import write_file
+from vitamin3d.exporters.mesh import write_cloud_ply, write_obj, write_ply
 from vitamin3d.exporters.normal_map import write_normal_map
 from vitamin3d.exporters.trajectory import write_tum
 from vitamin3d.geometry.camera import Camera
 from vitamin3d.scale import Scale
+from vitamin3d.timestamps import seconds_from_nanoseconds
 from vitamin3d.types import Array, DepthView, PointCloud, Surface, Trajectory
 
 FILES = (
@@ -119,7 +121,7 @@ class OutputFolder:
 
     def write_view(self, view: DepthView, scale: Scale) -> None:
         """`depth/<timestamp>.png` and `normals/<timestamp>.png` of a keyframe."""
-        name = f"{view.timestamp_ns // 10**9}.{view.timestamp_ns % 10**9:09d}.png"
+        name = f"{seconds_from_nanoseconds(view.timestamp_ns)}.png"
         write_depth_map(view.depth, self._folder("depth") / name, depth_counts(scale))
         write_normal_map(view.normals_cam, self._folder("normals") / name)
 

@@ -1,19 +1,16 @@
 # SPDX-License-Identifier: Apache-2.0
 """Trajectories in the TUM format, which every evaluation tool reads."""
 
-import os
 from collections.abc import Iterator, Sequence
 from pathlib import Path
 
 import numpy as np
 
-from vitamin3d.datasets.tables import seconds_from_nanoseconds
-from vitamin3d.datasets.trajectories import read_tum
 from vitamin3d.errors import OutputError
+from vitamin3d.exporters.files import write_file
 from vitamin3d.geometry.se3 import quaternion_xyzw
+from vitamin3d.timestamps import seconds_from_nanoseconds
 from vitamin3d.types import Array, Trajectory
-
-__all__ = ["read_tum", "write_tum"]
 
 
 def write_tum(trajectory: Trajectory, path: Path, comments: Sequence[str] = ()) -> None:
@@ -23,14 +20,7 @@ def write_tum(trajectory: Trajectory, path: Path, comments: Sequence[str] = ()) 
     """
     if not np.isfinite(trajectory.T_world_cam).all():
         raise OutputError(f"{path}: the trajectory holds poses that are not finite; nothing written")
-    text = "".join(f"{line}\n" for line in _lines(trajectory, comments))
-    temporary = path.with_name(f".{path.name}.{os.getpid()}.tmp")
-    try:
-        temporary.write_bytes(text.encode())
-        temporary.replace(path)
-    except OSError as error:
-        _remove(temporary)
-        raise OutputError(f"{path}: cannot be written ({error.strerror}); check the folder and the free space") from None
+    write_file(path, (f"{line}\n".encode() for line in _lines(trajectory, comments)))
 
 
 def _lines(trajectory: Trajectory, comments: Sequence[str]) -> Iterator[str]:
@@ -44,10 +34,3 @@ def _lines(trajectory: Trajectory, comments: Sequence[str]) -> Iterator[str]:
 def _numbers(T_world_cam: Array) -> str:
     values = np.concatenate([T_world_cam[:3, 3], quaternion_xyzw(T_world_cam[:3, :3])])
     return " ".join(f"{value:.9f}" for value in np.round(values, 9) + 0.0)
-
-
-def _remove(path: Path) -> None:
-    try:
-        path.unlink(missing_ok=True)
-    except OSError:
-        return

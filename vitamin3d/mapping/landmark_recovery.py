@@ -87,7 +87,7 @@ def _visible_candidates(sparse_map: SparseMap, live_ids: Array, T_cam_world: Arr
     distance_then, distance_now = np.linalg.norm(then, axis=1), np.linalg.norm(now, axis=1)
     similar = (then * now).sum(axis=1) > np.cos(np.radians(config.max_view_angle_deg)) * distance_then * distance_now
     ratio = distance_now / np.maximum(distance_then, 1e-12)
-    return ids[similar & (ratio < config.max_distance_ratio) & (ratio > 1.0 / config.max_distance_ratio)]
+    return np.asarray(ids[similar & (ratio < config.max_distance_ratio) & (ratio > 1.0 / config.max_distance_ratio)])
 
 
 def recover_landmarks(

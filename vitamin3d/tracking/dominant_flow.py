@@ -28,7 +28,7 @@ def coarse_features(image: Array, config: DominantFlowConfig) -> CoarseFeatures:
     scale = config.reduction
     size = (max(1, image.shape[1] // scale), max(1, image.shape[0] // scale))
     small = cv2.resize(image, size, interpolation=cv2.INTER_AREA)
-    orb = cv2.ORB_create(
+    orb = cv2.ORB_create(  # type: ignore[attr-defined]
         config.max_features, nlevels=1, edgeThreshold=PATCH_PX // 2 + 1, patchSize=PATCH_PX, fastThreshold=FAST_THRESHOLD
     )
     keypoints, descriptors = orb.detectAndCompute(small, None)
