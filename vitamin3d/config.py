@@ -170,7 +170,7 @@ class DelaunayConfig:
     """Of two landmarks nearer than this in the image, the more certain one becomes a vertex."""
     weight_scale: float = 0.02
     """Data weight of a vertex = weight_scale / relative deviation of its depth."""
-    deviation_floor: float = 0.007
+    deviation_floor: float = 0.01
     """Relative, added in quadrature: what landmarks share (poses, calibration) and mismatches are not in their deviations."""
 
 
