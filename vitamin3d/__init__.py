@@ -1,1 +1,69 @@
 # SPDX-License-Identifier: Apache-2.0
+"""vitamin3d: from the pictures of one calibrated camera to a trajectory, a dense cloud and a mesh, on a CPU.
+
+The public names are loaded when they are first used, so that importing the package costs nothing.
+"""
+
+from importlib import import_module
+from typing import TYPE_CHECKING, Any
+
+if TYPE_CHECKING:
+    from vitamin3d.config import Config, load_toml, paper_config
+    from vitamin3d.datasets import Unreadable, open_dataset
+    from vitamin3d.exporters.output_folder import OutputFolder
+    from vitamin3d.geometry.camera import Camera
+    from vitamin3d.job import Job, Selection, reconstruct_sequence
+    from vitamin3d.mapping.landmark_statistics import point_cloud
+    from vitamin3d.reconstruction import Reconstruction
+    from vitamin3d.runtime import SilentObserver, run_sequential, run_threaded
+    from vitamin3d.scale import Scale
+    from vitamin3d.slam import Slam
+    from vitamin3d.tracking.front_end import FrontEnd
+    from vitamin3d.types import Frame, SlamState, Surface, Trajectory
+
+_HOMES = {
+    "config": ("Config", "load_toml", "paper_config"),
+    "datasets": ("Unreadable", "open_dataset"),
+    "exporters.output_folder": ("OutputFolder",),
+    "geometry.camera": ("Camera",),
+    "mapping.landmark_statistics": ("point_cloud",),
+    "job": ("Job", "Selection", "reconstruct_sequence"),
+    "reconstruction": ("Reconstruction",),
+    "runtime": ("SilentObserver", "run_sequential", "run_threaded"),
+    "scale": ("Scale",),
+    "slam": ("Slam",),
+    "tracking.front_end": ("FrontEnd",),
+    "types": ("Frame", "SlamState", "Surface", "Trajectory"),
+}
+_MODULES = {name: module for module, names in _HOMES.items() for name in names}
+
+__all__ = [
+    "Camera",
+    "Config",
+    "Frame",
+    "FrontEnd",
+    "Job",
+    "OutputFolder",
+    "Reconstruction",
+    "Scale",
+    "Selection",
+    "SilentObserver",
+    "Slam",
+    "SlamState",
+    "Surface",
+    "Trajectory",
+    "Unreadable",
+    "load_toml",
+    "open_dataset",
+    "paper_config",
+    "point_cloud",
+    "reconstruct_sequence",
+    "run_sequential",
+    "run_threaded",
+]
+
+
+def __getattr__(name: str) -> Any:
+    if name not in _MODULES:
+        raise AttributeError(f"module 'vitamin3d' has no attribute {name!r}")
+    return getattr(import_module(f"vitamin3d.{_MODULES[name]}"), name)

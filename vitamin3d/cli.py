@@ -13,7 +13,7 @@ from vitamin3d.errors import InputError, Vitamin3dError
 
 if TYPE_CHECKING:
     from vitamin3d.config import Config
-    from vitamin3d.reconstruct_sequence import Job, Outcome
+    from vitamin3d.job import Job, Outcome
 
 EXIT_ERROR, EXIT_NO_MAP, EXIT_INTERRUPTED = 2, 3, 130
 ONE_THREAD_EACH = ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS")
@@ -55,7 +55,7 @@ def reconstruct(
 ) -> None:
     """Reconstruct a sequence: trajectory, cloud, meshes, depth and normal maps."""
     _one_thread_each()
-    from vitamin3d.reconstruct_sequence import Job, Selection
+    from vitamin3d.job import Job, Selection
 
     job = Job(
         _settings(mode, config, seed, _voxels(voxel_low, voxel_high, metric_scale, scale_from_ground_truth)),
@@ -125,8 +125,8 @@ def _run(source: Path, calibration: Path | None, job: "Job", out: Path, overwrit
     from vitamin3d._jit import kernels_are_cached
     from vitamin3d.datasets import open_dataset
     from vitamin3d.exporters.output_folder import OutputFolder
+    from vitamin3d.job import reconstruct_sequence
     from vitamin3d.progress import ConsoleObserver
-    from vitamin3d.reconstruct_sequence import reconstruct_sequence
 
     dataset = open_dataset(source, calibration)
     job.selection.indices(len(dataset))

@@ -137,7 +137,7 @@ class Camera:
         high = np.minimum(np.ceil(np.nanmax(ideal, axis=0)), size - 1 + np.ceil(limit * size))
         left, top = np.minimum(low, 0.0)
         width, height = (np.maximum(high, size - 1) - np.minimum(low, 0.0) + 1).astype(int)
-        return Camera(self.fx, self.fy, self.cx - left, self.cy - top, int(width), int(height))
+        return Camera(self.fx, self.fy, float(self.cx - left), float(self.cy - top), int(width), int(height))
 
     def canvas_maps(self, canvas: "Camera") -> tuple[Array, Array]:
         """`cv2.remap` maps (H, W) float32 that draw this camera's picture on `canvas`."""

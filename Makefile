@@ -1,0 +1,40 @@
+# SPDX-License-Identifier: Apache-2.0
+# Two commands on a fresh machine: `make demo` and `make test`.
+VENV   ?= .venv
+PYTHON ?= $(shell for p in python3.12 python3.11 python3.10 python3; do \
+            $$p -c 'import sys, venv, ensurepip; sys.exit(not (3, 10) <= sys.version_info[:2] < (3, 13))' 2>/dev/null && echo $$p && break; done)
+OUT    ?= demo_output
+PINS    = .ci/requirements.txt
+export OMP_NUM_THREADS ?= 1
+export OMP_WAIT_POLICY ?= passive
+
+.PHONY: demo test lint install clean
+
+demo: $(VENV)/.installed
+	$(VENV)/bin/vitamin3d reconstruct data/demo --out $(OUT) --overwrite --scale-from-ground-truth
+
+test: $(VENV)/.installed-dev
+	$(VENV)/bin/python -m pytest
+
+lint: $(VENV)/.installed-dev
+	$(VENV)/bin/ruff check .
+	$(VENV)/bin/mypy
+
+install: $(VENV)/.installed
+
+$(VENV)/bin/python:
+	@test -n "$(PYTHON)" || { echo "Python 3.10, 3.11 or 3.12 with venv is needed (Debian: sudo apt-get install python3-venv); or: make PYTHON=/path/to/python" >&2; exit 1; }
+	$(PYTHON) -m venv $(VENV)
+
+$(VENV)/.installed: pyproject.toml $(PINS) | $(VENV)/bin/python
+	@tools/system_libraries.sh
+	$(VENV)/bin/python -m pip install --quiet --disable-pip-version-check --constraint $(PINS) --editable .
+	@touch $@
+
+$(VENV)/.installed-dev: pyproject.toml $(PINS) | $(VENV)/bin/python
+	@tools/system_libraries.sh
+	$(VENV)/bin/python -m pip install --quiet --disable-pip-version-check --constraint $(PINS) --editable '.[dev,eval]'
+	@touch $@ $(VENV)/.installed
+
+clean:
+	rm -rf $(VENV) $(OUT)

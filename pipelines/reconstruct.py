@@ -1,0 +1,48 @@
+# SPDX-License-Identifier: Apache-2.0
+"""From a sequence to a mesh on one page of public API. Copy it and change a step.
+
+    python pipelines/reconstruct.py data/demo output
+
+The command `vitamin3d reconstruct` does the same with more options; see `vitamin3d/job.py`.
+"""
+
+import sys
+from pathlib import Path
+
+from vitamin3d import Config, FrontEnd, OutputFolder, Reconstruction, Scale, Slam, Unreadable, open_dataset, point_cloud
+
+
+def main(argv: list[str] | None = None) -> int:
+    """Reconstructs `argv[0]` (a folder or a video; optionally a calibration third) into the folder `argv[1]`."""
+    source, out, *calibration = sys.argv[1:] if argv is None else argv
+    dataset = open_dataset(Path(source), Path(calibration[0]) if calibration else None)
+    config, scale, output = Config(), Scale(), OutputFolder(Path(out), overwrite=True)
+
+    front_end = FrontEnd(config)  # curvature, its extrema, and the flow between two pictures
+    slam = Slam(dataset.camera, config)  # tracks the extrema, localises the camera, maps the landmarks
+    reconstruction = Reconstruction(dataset.camera, config)  # meshes, denoises and fuses the keyframes
+
+    for index in range(len(dataset)):
+        frame = dataset.read(index)
+        if isinstance(frame, Unreadable):
+            print(f"skipped {frame.path}: {frame.reason}", file=sys.stderr)
+            continue
+        slam.process_frame(front_end.process(frame))
+        for keyframe, picture in slam.take_settled_keyframes():  # those that the adjustment will not move any more
+            reconstruction.add_keyframe(slam.snapshot(keyframe, picture))
+    for keyframe, picture in slam.take_settled_keyframes(everything=True):
+        reconstruction.add_keyframe(slam.snapshot(keyframe, picture))
+
+    if slam.map.num_keyframes == 0:
+        print(f"no map: {slam.initialization_reason}", file=sys.stderr)
+        return 3
+    output.write_config(config)
+    output.write_trajectories(slam.trajectory(), slam.keyframe_trajectory(), scale)
+    output.write_cloud(point_cloud(slam.map, dataset.camera, config.cloud, config.snapshot.observation_sigma_px), scale, "")
+    output.write_surfaces(*reconstruction.surfaces(), scale, reconstruction.voxel_lengths())
+    print(f"{len(slam.trajectory())} of {len(dataset)} frames localised, {slam.map.num_keyframes} keyframes: {output.path}")
+    return 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())
