@@ -163,3 +163,7 @@ def main() -> None:
     except KeyboardInterrupt:
         print("vitamin3d: interrupted, nothing saved", file=sys.stderr)
         sys.exit(EXIT_INTERRUPTED)
+
+
+if __name__ == "__main__":
+    main()
