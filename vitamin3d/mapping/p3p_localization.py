@@ -41,9 +41,11 @@ def _cost(intrinsics, R, t, points, pixels, squared_sigma):  # type: ignore[no-u
 
 @kernel
 def _refine(intrinsics, R, t, points, pixels, squared_sigma, iterations):  # type: ignore[no-untyped-def]
-    """Levenberg–Marquardt in place on R (3, 3), t (3,); the cost never rises."""
+    """Levenberg–Marquardt in place on R (3, 3), t (3,); the cost never rises. NaN input moves nothing."""
     H, g, R_new, t_new = np.empty((6, 6)), np.empty(6), np.empty((3, 3)), np.empty(3)
     damping, cost = 1e-6, _cost(intrinsics, R, t, points, pixels, squared_sigma)
+    if np.isnan(cost):
+        return
     for _ in range(iterations):
         _normal_equations(intrinsics, R, t, points, pixels, squared_sigma, H, g)
         for m in range(6):

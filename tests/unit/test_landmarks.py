@@ -1,0 +1,330 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Landmarks: triangulated, found again, and what is known about them."""
+
+import dataclasses
+
+import numpy as np
+import pytest
+import reference
+from scenes import PINHOLE, arc_scene, map_of, texture, warped, with_noise
+
+from vitamin3d.config import CloudConfig, CurvatureConfig, ExtremaConfig, RecoveryConfig, SnapshotConfig, TriangulationConfig
+from vitamin3d.geometry.camera import Camera
+from vitamin3d.geometry.se3 import exp_se3, inverse
+from vitamin3d.mapping.landmark_recovery import _climb_strict, cut_patches, patch_similarity, recover_landmarks
+from vitamin3d.mapping.landmark_statistics import (
+    keyframe_vertices,
+    landmark_information,
+    landmark_statistics,
+    point_cloud,
+    relative_depth_deviations,
+)
+from vitamin3d.mapping.landmark_triangulation import triangulate_landmarks
+from vitamin3d.mapping.sparse_map import SparseMap
+from vitamin3d.tracking.curvature import curvature
+from vitamin3d.tracking.extrema import detect_extrema, refine_extrema
+from vitamin3d.types import Tracks
+
+# --- triangulation -----------------------------------------------------------------------------------------------
+
+
+def two_keyframes(points, T_1_0, offset_1=(0.0, 0.0)):
+    """A map without points of two keyframes that see all points."""
+    result = SparseMap()
+    for k, T in enumerate((np.eye(4), T_1_0)):
+        pixels = np.array([reference.residual(PINHOLE.intrinsics, T, X, np.zeros(2)) for X in points]) + k * np.asarray(offset_1)
+        n = len(points)
+        result.add_keyframe(k, k, T, np.arange(n), pixels, np.zeros((n, 3), np.uint8), np.zeros((n, 81), np.uint8))
+    return result
+
+
+SIDEWAYS = np.eye(4)
+SIDEWAYS[0, 3] = -0.2
+
+
+def test_tracks_get_their_points(rng):
+    points = rng.uniform([-1, -1, 2], [1, 1, 5], (40, 3))
+    sparse_map = two_keyframes(points, SIDEWAYS)
+    assert triangulate_landmarks(sparse_map, PINHOLE, TriangulationConfig()) == 40
+    np.testing.assert_allclose(sparse_map.points_world, points, rtol=1e-9)
+    sparse_map.points_world[:] += 1.0
+    assert triangulate_landmarks(sparse_map, PINHOLE, TriangulationConfig()) == 0  # they have points
+    np.testing.assert_allclose(sparse_map.points_world, points + 1, rtol=1e-9)
+
+
+def test_points_need_parallax():
+    points = np.array([[0.0, 0, 10], [0, 0, 12]])  # 0.2 units apart: 1.15° and 0.95°
+    sparse_map = two_keyframes(points, SIDEWAYS)
+    assert triangulate_landmarks(sparse_map, PINHOLE, TriangulationConfig(min_parallax_deg=1.0)) == 1
+    np.testing.assert_array_equal(sparse_map.is_mapped(np.arange(2)), [True, False])
+
+
+def test_points_need_to_reproject():
+    points = np.array([[0.1, 0.2, 3.0]])
+    for offset, count in ((5.8, 1), (6.3, 0)):  # half of a sideways offset in each picture, above 3 px too much
+        sparse_map = two_keyframes(points, SIDEWAYS, (0.0, offset))
+        assert triangulate_landmarks(sparse_map, PINHOLE, TriangulationConfig(max_reprojection_px=3.0)) == count, offset
+
+
+def test_points_need_to_lie_in_front():
+    sparse_map = two_keyframes(np.array([[0.0, 0.0, 3.0]]), SIDEWAYS, (80.0, 0.0))  # the rays part
+    assert triangulate_landmarks(sparse_map, PINHOLE, TriangulationConfig()) == 0
+    assert np.isnan(sparse_map.points_world).all()
+
+
+def test_points_need_their_observations():
+    sparse_map = two_keyframes(np.array([[0.0, 0.0, 3.0]]), SIDEWAYS)
+    assert triangulate_landmarks(sparse_map, PINHOLE, TriangulationConfig(min_observations=3)) == 0
+    sparse_map.obs_valid[1] = False
+    assert triangulate_landmarks(sparse_map, PINHOLE, TriangulationConfig()) == 0
+
+
+def test_only_the_newest_keyframes_tracks_and_their_counting_observations(scene):
+    sparse_map = map_of(scene, with_points=False)
+    newest = sparse_map.obs_landmark[sparse_map.observations_of(7)]
+    sparse_map.remove_landmarks(newest[:5])  # these start afresh: no earlier observation is left
+    assert triangulate_landmarks(sparse_map, PINHOLE, TriangulationConfig()) == len(newest) - 5
+    np.testing.assert_allclose(sparse_map.points_world[newest[5:]], scene.points[newest[5:]], rtol=1e-8)
+    others = np.setdiff1d(np.arange(300), newest[5:])
+    assert np.isnan(sparse_map.points_world[others]).all()
+
+
+# --- recovery ----------------------------------------------------------------------------------------------------
+
+CAMERA = Camera(260.0, 255.0, 160.0, 119.0, 320, 240)
+DEPTH, SHIFT = 5.0, np.array([7.0, -4.0])
+MOVED = np.eye(4)
+MOVED[:2, 3] = SHIFT * DEPTH / [CAMERA.fx, CAMERA.fy]
+CONFIG = RecoveryConfig()
+
+
+@pytest.fixture
+def wall():
+    """A flat wall with landmarks on its extrema, seen in three keyframes; a frame in which it has moved by SHIFT pixels."""
+    image = texture(240, 320, np.random.default_rng(8), 4.0)
+    moved = warped(image, np.eye(2), SHIFT)
+    kappa = curvature(image, CurvatureConfig())
+    pixels = refine_extrema(kappa, detect_extrema(kappa, ExtremaConfig(border_px=25, min_curvature=20.0)))
+    points = CAMERA.rays_from_ideal(pixels) * DEPTH
+    sparse_map = SparseMap()
+    for k in range(3):
+        colors = np.zeros((len(pixels), 3), np.uint8)
+        sparse_map.add_keyframe(k, k, np.eye(4), np.arange(len(pixels)), pixels, colors, cut_patches(image, pixels))
+    sparse_map.points_world[:] = points
+    return sparse_map, pixels, moved, curvature(moved, CurvatureConfig())
+
+
+def recovered(wall, tracks=None, T=MOVED, config=CONFIG, camera=CAMERA):
+    sparse_map, _, image, kappa = wall
+    return recover_landmarks(Tracks.empty() if tracks is None else tracks, sparse_map, image, kappa, T, camera, config)
+
+
+def some_tracks(ids, pixels):
+    n = len(ids)
+    return Tracks(np.array(ids), pixels, np.ones(n, np.float32), np.full(n, 9, np.int32), np.zeros(n, np.int32))
+
+
+def test_landmarks_are_found_where_they_project(wall):
+    found = recovered(wall)
+    truth = wall[1][found.ids] + SHIFT
+    assert len(wall[1]) > 150 and len(found) > 0.95 * len(wall[1])
+    assert np.linalg.norm(found.pixels - truth, axis=1).max() < 0.3
+    assert (found.ages == 0).all() and (found.missed == 0).all()
+    assert len(np.unique(found.ids)) == len(found)
+
+
+def test_a_patch_that_disagrees_is_not_found(wall, rng):
+    ids = set(recovered(wall).ids.tolist())
+    spoilt = np.array(sorted(ids))[::3]
+    wall[0].patches[spoilt] = rng.integers(0, 255, (len(spoilt), 81))
+    again = set(recovered(wall).ids.tolist())
+    assert not again & set(spoilt.tolist()) and again == ids - set(spoilt.tolist())
+
+
+def test_a_projection_beyond_the_gate_is_not_found(wall):
+    ids = recovered(wall).ids
+    wall[0].points_world[ids[::2], 0] += 3.5 * DEPTH / CAMERA.fx
+    again = recovered(wall).ids
+    assert np.isin(ids[1::2], again).all()
+    assert np.isin(ids[::2], again).mean() < 0.1
+
+
+def test_what_is_tracked_is_not_taken_up_again(wall):
+    ids = recovered(wall).ids
+    live = some_tracks(ids[:20], wall[1][ids[:20]] + SHIFT)
+    found = recovered(wall, live)
+    np.testing.assert_array_equal(found.ids[:20], ids[:20])
+    np.testing.assert_array_equal(found.pixels[:20], live.pixels)
+    assert sorted(found.ids.tolist()) == sorted(ids.tolist())
+
+
+def test_a_landmark_takes_the_place_of_a_mere_track_but_not_of_a_landmark(wall):
+    sparse_map, pixels = wall[:2]
+    ids = recovered(wall).ids
+    mere = some_tracks([5000, 5001], np.array([pixels[ids[0]] + SHIFT, [3.0, 3.0]]))
+    found = recovered(wall, mere)
+    assert 5000 not in found.ids and 5001 in found.ids and ids[0] in found.ids
+    impostor = some_tracks([ids[1]], pixels[ids[:1]] + SHIFT)  # another landmark stands where ids[0] projects
+    assert sparse_map.is_mapped(impostor.ids).all()
+    found = recovered(wall, impostor)
+    assert ids[0] not in found.ids and ids[1] in found.ids
+
+
+@pytest.mark.parametrize(("turn_deg", "is_found"), [(25.0, True), (40.0, False)])
+def test_landmarks_seen_from_another_direction_are_left(wall, turn_deg, is_found):
+    sparse_map = wall[0]
+    angle = np.radians(turn_deg)
+    T_world_cam = exp_se3(np.array([0, 0, 0, 0, -angle, 0]))
+    T_world_cam[:3, 3] = [DEPTH * np.sin(angle), 0, DEPTH * (1 - np.cos(angle))]
+    sparse_map.T_cam_world[2] = inverse(T_world_cam)  # the last keyframe looked from the side
+    middle = np.flatnonzero(np.linalg.norm(sparse_map.points_world[:, :2], axis=1) < 0.5)
+    assert len(middle) > 5
+    share = np.isin(middle, recovered(wall).ids).mean()
+    assert share > 0.9 if is_found else share == 0.0
+
+
+@pytest.mark.parametrize(("factor", "is_found"), [(1.15, True), (1.4, False), (0.88, True), (0.7, False)])
+def test_landmarks_seen_from_another_distance_are_left(wall, factor, is_found):
+    wall[0].T_cam_world[2, 2, 3] = DEPTH * (factor - 1)
+    found = recovered(wall)
+    assert len(found) > 0.9 * len(wall[1]) if is_found else len(found) == 0
+
+
+def test_landmarks_with_few_observations_are_left(wall):
+    assert len(recovered(wall, config=dataclasses.replace(CONFIG, min_observations=4))) == 0
+
+
+def test_nothing_is_found_behind_or_outside(wall):
+    behind = exp_se3(np.array([0, 0, 0, 0, np.pi, 0]))
+    away = np.eye(4)
+    away[0, 3] = 100.0
+    assert len(recovered(wall, T=behind)) == 0 and len(recovered(wall, T=away)) == 0
+
+
+def test_patches_equal_their_twin(rng):
+    image = rng.integers(0, 255, (23, 31), np.uint8)
+    pixels = rng.uniform(-3, [33, 25], (50, 2))
+    np.testing.assert_array_equal(cut_patches(image, pixels), [reference.patch(image, p, 4) for p in pixels])
+    assert cut_patches(image, pixels[:0]).shape == (0, 81)
+
+
+def test_similarity_is_the_correlation_coefficient(rng):
+    a, b = rng.integers(0, 255, (2, 20, 81), np.uint8)
+    b[:10] = np.clip(a[:10] * 0.6 + 40 + rng.normal(0, 5, (10, 81)), 0, 255)
+    expected = [np.corrcoef(x.astype(float), y.astype(float))[0, 1] for x, y in zip(a, b, strict=True)]
+    np.testing.assert_allclose(patch_similarity(a, b), expected, atol=1e-10)
+    np.testing.assert_allclose(patch_similarity(a, a), 1.0)
+    np.testing.assert_allclose(patch_similarity(a, 255 - a), -1.0)
+    np.testing.assert_array_equal(patch_similarity(np.full((2, 81), 9, np.uint8), a[:2]), 0.0)
+
+
+def test_strict_climbing_equals_its_twin(rng):
+    kappa = rng.standard_normal((30, 40)).astype(np.float32)
+    predicted = rng.uniform(3, [36, 26], (150, 2))
+    out, found = np.empty((150, 2)), np.empty(150, np.bool_)
+    _climb_strict(kappa, predicted, 4, 2.0, out, found)
+    for i, p in enumerate(predicted):
+        twin = reference.climbed(kappa, p, 0.0, 1.0, 4, 2.0)
+        assert found[i] == (twin is not None)
+        if twin is not None:
+            np.testing.assert_allclose(out[i], twin, atol=1e-4)
+    assert 20 < found.sum() < 145
+
+
+# --- statistics --------------------------------------------------------------------------------------------------
+
+
+@pytest.fixture
+def noisy_map():
+    """Five keyframes, sixty landmarks; observations removed, landmarks without points, one restarted."""
+    rng = np.random.default_rng(4)
+    result = map_of(with_noise(arc_scene(5, 60, rng), rng, 0.5, 0.0)[0])
+    result.remove_observations(rng.choice(len(result.obs_landmark), 30, replace=False))
+    result.points_world[[4, 9]] = np.nan
+    result.first_observation[7] = np.flatnonzero(result.obs_landmark == 7)[1]
+    result.num_observations[7] = len(reference.counting_observations(result, 7))
+    return result
+
+
+def rays_of(sparse_map, id_):
+    rows = reference.counting_observations(sparse_map, id_)
+    rays = [sparse_map.points_world[id_] - inverse(sparse_map.T_cam_world[k])[:3, 3] for _, k in rows]
+    return rows, [ray / np.linalg.norm(ray) for ray in rays]
+
+
+def test_statistics_equal_their_twin(noisy_map):
+    statistics = landmark_statistics(noisy_map, PINHOLE)
+    assert len(statistics.num_observations) == 60
+    for id_ in range(60):
+        if np.isnan(noisy_map.points_world[id_, 0]):
+            assert statistics.num_observations[id_] == 0
+            continue
+        rows, rays = rays_of(noisy_map, id_)
+        errors = [
+            reference.residual(PINHOLE.intrinsics, noisy_map.T_cam_world[k], noisy_map.points_world[id_], noisy_map.obs_pixels[i])
+            for i, k in rows
+        ]
+        assert statistics.num_observations[id_] == len(rows) == noisy_map.num_observations[id_]
+        assert statistics.reprojection_rms_px[id_] == pytest.approx(np.sqrt(np.mean([e @ e for e in errors])), rel=1e-9)
+        angle = max(np.degrees(np.arctan2(np.linalg.norm(np.cross(rays[0], ray)), rays[0] @ ray)) for ray in rays)
+        assert statistics.parallax_deg[id_] == pytest.approx(angle, abs=1e-5)
+
+
+def test_information_equals_its_twin(noisy_map):
+    ids = np.flatnonzero(np.isfinite(noisy_map.points_world[:, 0]))[::-1]
+    found = landmark_information(noisy_map, ids, PINHOLE, 0.7)
+    for H, id_ in zip(found, ids, strict=True):
+        expected = np.zeros((3, 3))
+        for _, k in reference.counting_observations(noisy_map, id_):
+            _, J = reference.jacobians(PINHOLE.intrinsics, noisy_map.T_cam_world[k], noisy_map.points_world[id_])
+            expected += J.T @ J / 0.7**2
+        np.testing.assert_allclose(H, expected, rtol=1e-9, atol=1e-9 * np.abs(expected).max())
+
+
+def test_depth_deviation_is_what_noise_does_to_the_depth(scene, rng):
+    """Monte Carlo: one landmark, solved for again and again from noisy pixels."""
+    sparse_map, id_, sigma = map_of(scene), 6, 0.7
+    rows = reference.counting_observations(sparse_map, id_)
+    X, T = sparse_map.points_world[id_], sparse_map.T_cam_world[3]
+    J = np.vstack([reference.jacobians(PINHOLE.intrinsics, sparse_map.T_cam_world[k], X)[1] for _, k in rows])
+    steps = np.linalg.lstsq(J, sigma * rng.standard_normal((len(J), 20_000)), rcond=None)[0]
+    depths = (T[:3, :3] @ (X[:, None] + steps) + T[:3, 3:])[2]
+    deviation = relative_depth_deviations(landmark_information(sparse_map, np.array([id_]), PINHOLE, sigma), X[None], T)
+    assert deviation[0] == pytest.approx(depths.std() / depths.mean(), rel=0.03)
+
+
+def test_one_view_leaves_the_depth_open(scene):
+    sparse_map = map_of(scene)
+    rows = [i for i, _ in reference.counting_observations(sparse_map, 5)]
+    sparse_map.obs_valid[rows[1:]] = False
+    deviation = relative_depth_deviations(landmark_information(sparse_map, np.array([5]), PINHOLE, 1.0), scene.points[5:6], np.eye(4))
+    assert deviation[0] > 1e3
+
+
+def test_vertices_of_a_keyframe_are_its_good_landmarks(noisy_map):
+    pixels, depths, deviations = keyframe_vertices(noisy_map, 3, PINHOLE, SnapshotConfig(min_observations=3))
+    mine = noisy_map.obs_landmark[noisy_map.observations_of(3)][noisy_map.obs_valid[noisy_map.observations_of(3)]]
+    good = [i for i in mine if noisy_map.is_mapped(np.array([i]))[0] and noisy_map.num_observations[i] >= 3]
+    T = noisy_map.T_cam_world[3]
+    in_camera = np.array([T[:3, :3] @ noisy_map.points_world[i] + T[:3, 3] for i in good])
+    assert 10 < len(good) < 40
+    np.testing.assert_allclose(depths, in_camera[:, 2], rtol=1e-12)
+    np.testing.assert_allclose(pixels, (in_camera / in_camera[:, 2:] @ PINHOLE.K.T)[:, :2], rtol=1e-10)
+    assert ((deviations > 1e-4) & (deviations < 0.05)).all()
+    limit = float(np.median(deviations))
+    tight = keyframe_vertices(noisy_map, 3, PINHOLE, SnapshotConfig(min_observations=3, max_relative_deviation=limit))
+    assert len(tight[1]) == (deviations < limit).sum()
+
+
+def test_the_cloud_is_filtered(noisy_map):
+    statistics = landmark_statistics(noisy_map, PINHOLE)
+    config = CloudConfig(min_observations=3, min_parallax_deg=6.0, max_reprojection_rms_px=0.8)
+    good = np.isfinite(noisy_map.points_world[:, 0]) & (statistics.num_observations >= 3)
+    good &= (statistics.parallax_deg >= 6.0) & (statistics.reprojection_rms_px <= 0.8)
+    cloud = point_cloud(noisy_map, PINHOLE, config, 0.7)
+    assert 5 < good.sum() < 55
+    np.testing.assert_array_equal(cloud.points_world, noisy_map.points_world[good])
+    np.testing.assert_array_equal(cloud.num_observations, statistics.num_observations[good])
+    np.testing.assert_array_equal(cloud.colors, noisy_map.colors[good])
+    assert ((cloud.depth_deviation > 1e-4) & (cloud.depth_deviation < 0.05)).all()
+    assert len(point_cloud(noisy_map, PINHOLE, CloudConfig(min_observations=99), 0.7).points_world) == 0
