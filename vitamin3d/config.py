@@ -18,14 +18,25 @@ if sys.version_info >= (3, 11):
 else:
     import tomli as tomllib
 
+CHOICES = {
+    "extrema_tracking.prediction": ("dense_flow", "dominant_flow"),
+    "bundle_adjustment.keyframe_solver": ("schur", "subspace"),
+    "fusion.backend": ("scalable", "voxel_block_grid"),
+}
+AT_LEAST_ONE = ("extrema.refill_interval", "dominant_flow.reduction", "initialization.history", "recovery.interval", "window.keyframes")
+
 
 @dataclass(frozen=True)
 class CurvatureConfig:
+    """Sec. 2.1, Eq. 1."""
+
     smoothing_sigma_px: float = 2.0
 
 
 @dataclass(frozen=True)
 class ExtremaConfig:
+    """Sec. 2.1: which maxima of the curvature become tracks."""
+
     min_curvature: float = 0.3
     """Noise floor of kappa, grey levels³ per pixel⁴ of the smoothed 0–255 image."""
     max_tracks: int = 5000
@@ -68,6 +79,8 @@ class ExtremaTrackingConfig:
 
 @dataclass(frozen=True)
 class InitializationConfig:
+    """Sec. 5.1: when two frames become the first map."""
+
     min_motion_px: float = 25.0
     min_parallax_deg: float = 1.0
     """Median over the triangulated points."""
@@ -83,6 +96,8 @@ class InitializationConfig:
 
 @dataclass(frozen=True)
 class LocalizationConfig:
+    """Sec. 5.1: P3P RANSAC and the refinement of a frame's pose."""
+
     prior_inlier_ratio: float = 0.6
     """Where the motion model explains this share of the landmarks, RANSAC is skipped; above 1: never."""
     ransac_points: int = 400
@@ -97,6 +112,8 @@ class LocalizationConfig:
 
 @dataclass(frozen=True)
 class KeyframeConfig:
+    """When a frame becomes a keyframe."""
+
     motion_px: float = 12.0
     """Median motion of the landmarks since the last keyframe."""
     min_tracked_ratio: float = 0.6
@@ -106,6 +123,8 @@ class KeyframeConfig:
 
 @dataclass(frozen=True)
 class TriangulationConfig:
+    """Sec. 5.1: when a track becomes a landmark."""
+
     min_parallax_deg: float = 1.0
     max_reprojection_px: float = 3.0
     min_observations: int = 2
@@ -128,6 +147,8 @@ class RecoveryConfig:
 
 @dataclass(frozen=True)
 class WindowConfig:
+    """Which keyframes take part in an adjustment."""
+
     keyframes: int = 20
     anchors: int = 60
     """Older keyframes, poses fixed, that share most landmarks with the window."""
@@ -136,6 +157,8 @@ class WindowConfig:
 
 @dataclass(frozen=True)
 class BundleAdjustmentConfig:
+    """Sec. 3, Eq. 6–12."""
+
     sigma_px: float = 2.0
     sweeps_per_frame: int = 2
     """Subspace Gauss–Newton sweeps over the window at every frame (Eq. 11–12)."""
@@ -165,6 +188,8 @@ class SnapshotConfig:
 
 @dataclass(frozen=True)
 class DelaunayConfig:
+    """Sec. 4.2: landmarks to a triangulation of the picture."""
+
     min_vertices: int = 30
     min_separation_px: float = 1.0
     """Of two landmarks nearer than this in the image, the more certain one becomes a vertex."""
@@ -190,6 +215,8 @@ class NltgvConfig:
 
 @dataclass(frozen=True)
 class DepthRenderingConfig:
+    """Sec. 4.2: which triangles become depth."""
+
     max_inverse_depth_range: float = 0.25
     """A triangle whose inverse depths differ by more, relative to their mean, spans a depth edge."""
     max_slant_deg: float = 80.0
@@ -200,6 +227,8 @@ class DepthRenderingConfig:
 
 @dataclass(frozen=True)
 class FusionConfig:
+    """Sec. 4.2: the two TSDF volumes."""
+
     backend: str = "scalable"
     """`scalable` (Open3D ScalableTSDFVolume) or `voxel_block_grid`."""
     voxel_low: float | None = None
@@ -214,6 +243,8 @@ class FusionConfig:
 
 @dataclass(frozen=True)
 class SurfaceConfig:
+    """Cleaning of the extracted meshes."""
+
     min_component_triangles: int = 200
     """Smaller connected pieces of the fine mesh are removed, and pieces of the same area of the coarse one."""
 
@@ -278,7 +309,7 @@ def load_toml(path: Path, base: Config | None = None) -> Config:
     """`base` (default: `Config()`) with the settings of a TOML file.
 
     Raises:
-        InputError: the file cannot be read, or holds a name or a type that `Config` does not have.
+        InputError: the file cannot be read, or holds a name, a type or a value that `Config` does not have.
     """
     try:
         table = tomllib.loads(path.read_text())
@@ -306,4 +337,15 @@ def _coerced(old: Any, value: Any, path: Path, name: str) -> Any:
     number = (int, float) if old is None or isinstance(old, float) else type(old)
     if not isinstance(value, number) or isinstance(value, bool) != isinstance(old, bool):
         raise InputError(f"{path}: {name} must be like {old!r}, not {value!r}")
+    _check_value(value, path, name)
     return float(value) if isinstance(old, float) or old is None else value
+
+
+def _check_value(value: Any, path: Path, name: str) -> None:
+    """InputError for a value of the right type that no run could use."""
+    if name in CHOICES and value not in CHOICES[name]:
+        raise InputError(f"{path}: {name} must be one of {', '.join(CHOICES[name])}, not {value!r}")
+    if not isinstance(value, str) and not 0 <= value < float("inf"):
+        raise InputError(f"{path}: {name} must be a finite number, not negative; it is {value!r}")
+    if name in AT_LEAST_ONE and value < 1:
+        raise InputError(f"{path}: {name} must be at least 1, not {value!r}")

@@ -1,0 +1,132 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Who may import whom, and other rules that a reader of one file cannot see."""
+
+import ast
+import functools
+import itertools
+from pathlib import Path
+
+import pytest
+
+ROOT = Path(__file__).parents[1] / "vitamin3d"
+FILES = sorted(ROOT.rglob("*.py"))
+NAMES = [str(path.relative_to(ROOT)) for path in FILES]
+FORBIDDEN = {
+    "errors": ("",),
+    "_jit": ("",),
+    "types": ("config", "geometry", "tracking", "mapping", "dense", "datasets", "exporters"),
+    "config": ("types", "geometry", "tracking", "mapping", "dense", "datasets", "exporters"),
+    "geometry": ("tracking", "mapping", "dense", "datasets", "exporters"),
+    "tracking": ("mapping", "dense", "datasets", "exporters"),
+    "mapping": ("dense", "datasets", "exporters"),
+    "dense": ("tracking", "mapping", "datasets", "exporters"),
+    "datasets": ("tracking", "mapping", "dense", "exporters"),
+    "exporters": ("tracking", "mapping", "dense", "datasets"),
+    "evaluation": ("tracking", "mapping", "dense"),
+}
+"""Unit -> what it must not import from `vitamin3d.`; the empty name: nothing of ours at all."""
+ABOVE = ("slam", "reconstruction", "runtime", "reconstruct_sequence", "run_statistics", "progress", "cli")
+LAZY = ("open3d", "pymeshlab")
+MAX_LINES = 60
+
+
+@functools.cache
+def tree(path):
+    return ast.parse(path.read_text())
+
+
+def unit(path):
+    """`geometry` of geometry/camera.py, `slam` of slam.py."""
+    return path.relative_to(ROOT).with_suffix("").parts[0]
+
+
+def imports(node):
+    """Names of the modules that a tree imports, wherever."""
+    for statement in ast.walk(node):
+        if isinstance(statement, ast.Import):
+            yield from (alias.name for alias in statement.names)
+        elif isinstance(statement, ast.ImportFrom):
+            assert statement.level == 0, "imports are absolute"
+            yield statement.module
+
+
+def importers(*modules):
+    return {name for name, path in zip(NAMES, FILES, strict=True) if {m.split(".")[0] for m in imports(tree(path))} & set(modules)}
+
+
+def functions(path):
+    return [node for node in ast.walk(tree(path)) if isinstance(node, (ast.FunctionDef, ast.AsyncFunctionDef))]
+
+
+def test_there_is_something_to_check():
+    assert len(FILES) > 40 and {"slam.py", "mapping/sparse_map.py", "dense/nltgv.py"} <= set(NAMES)
+
+
+def test_numba_is_imported_in_one_file():
+    assert importers("numba") == {"_jit.py"}
+
+
+def test_threads_are_known_to_one_file():
+    assert importers("threading", "queue", "multiprocessing", "concurrent", "asyncio") == {"runtime.py"}
+
+
+def test_heavy_libraries_are_imported_where_they_are_used():
+    assert all(name.startswith(("dense/", "exporters/")) for name in importers("open3d"))
+    assert all(name.startswith("dense/") for name in importers("pymeshlab"))
+    for path in FILES:
+        at_import = [node for node in tree(path).body if not isinstance(node, (ast.FunctionDef, ast.ClassDef))]
+        at_import += [n for c in tree(path).body if isinstance(c, ast.ClassDef) for n in c.body if not isinstance(n, ast.FunctionDef)]
+        eager = {m.split(".")[0] for node in at_import if not is_type_checking(node) for m in imports(node)}
+        assert not eager & set(LAZY), path
+
+
+def is_type_checking(node):
+    return isinstance(node, ast.If) and isinstance(node.test, ast.Name) and node.test.id == "TYPE_CHECKING"
+
+
+@pytest.mark.parametrize("path", FILES, ids=NAMES)
+def test_layers(path):
+    ours = [m.removeprefix("vitamin3d").lstrip(".") for m in imports(tree(path)) if m.split(".")[0] == "vitamin3d"]
+    for module, bad in itertools.product(ours, FORBIDDEN.get(unit(path), ())):
+        assert bad and module.split(".")[0] != bad, f"{unit(path)} imports {module}"
+    if unit(path) in FORBIDDEN:
+        assert not {module.split(".")[0] for module in ours} & set(ABOVE)
+
+
+def test_no_drawer_for_odds_and_ends():
+    words = {"utils", "util", "common", "helpers", "helper", "misc"}
+    assert not {part for path in FILES for part in path.relative_to(ROOT).with_suffix("").parts} & words
+
+
+def test_kernels_are_neither_parallel_nor_fast_and_loose():
+    for path in FILES:
+        for call in (node for node in ast.walk(tree(path)) if isinstance(node, ast.Call)):
+            assert not {keyword.arg for keyword in call.keywords} & {"parallel", "fastmath"}, path
+
+
+def is_kernel(function):
+    return any(isinstance(d, ast.Name) and d.id in ("kernel", "inlined") for d in function.decorator_list)
+
+
+def test_functions_fit_on_a_page():
+    sizes = {
+        f"{name}:{function.name}": function.end_lineno - function.lineno + 1
+        for name, path in zip(NAMES, FILES, strict=True)
+        for function in functions(path)
+        if not is_kernel(function)
+    }
+    assert len(sizes) > 200
+    assert {name: size for name, size in sizes.items() if size > MAX_LINES} == {}
+
+
+@pytest.mark.parametrize("path", FILES, ids=NAMES)
+def test_the_licence_comes_first(path):
+    assert path.read_text().startswith("# SPDX-License-Identifier: Apache-2.0\n")
+
+
+@pytest.mark.parametrize("path", [path for path in FILES if path.name != "__init__.py"], ids=[n for n in NAMES if "__init__" not in n])
+def test_what_is_public_is_documented(path):
+    assert ast.get_docstring(tree(path)), "the module"
+    public = [node for node in tree(path).body if isinstance(node, (ast.FunctionDef, ast.ClassDef)) and not node.name.startswith("_")]
+    missing = [node.name for node in public if not ast.get_docstring(node)]
+    assert missing == []
