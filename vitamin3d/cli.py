@@ -41,7 +41,7 @@ def reconstruct(
     mode: Annotated[Mode, typer.Option(help="default: what measures best; paper: the literal paper.")] = Mode.default,
     config: Annotated[Path | None, typer.Option(help="TOML file with settings that differ from the mode's.")] = None,
     threads: Annotated[bool, typer.Option("--threads/--sequential", help="Overlap the steps, or one after the other.")] = True,
-    seed: Annotated[int | None, typer.Option(help="Of the random samples.")] = None,
+    seed: Annotated[int | None, typer.Option(min=0, help="Of the random samples.")] = None,
     start: Annotated[int, typer.Option(min=0, help="First frame.")] = 0,
     max_frames: Annotated[int | None, typer.Option(min=2, help="At most so many frames.")] = None,
     stride: Annotated[int, typer.Option(min=1, help="Every so many-th frame.")] = 1,
@@ -65,7 +65,12 @@ def reconstruct(
         scale_from_ground_truth,
         save_tracks,
     )
-    raise typer.Exit(_run(source, calibration, job, out, overwrite, quiet))
+    try:
+        code = _run(source, calibration, job, out, overwrite, quiet)
+    except KeyboardInterrupt:  # caught here: Typer would end without a word
+        typer.echo("vitamin3d: interrupted, nothing saved", err=True)
+        code = EXIT_INTERRUPTED
+    raise typer.Exit(code)
 
 
 @app.command("config")
@@ -160,9 +165,6 @@ def main() -> None:
     except Vitamin3dError as error:
         print(f"vitamin3d: {error}", file=sys.stderr)
         sys.exit(EXIT_ERROR)
-    except KeyboardInterrupt:
-        print("vitamin3d: interrupted, nothing saved", file=sys.stderr)
-        sys.exit(EXIT_INTERRUPTED)
 
 
 if __name__ == "__main__":
