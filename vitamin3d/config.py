@@ -184,6 +184,7 @@ class SnapshotConfig:
     min_observations: int = 3
     observation_sigma_px: float = 0.7
     max_relative_deviation: float = 0.5
+    max_reprojection_rms_px: float = 1.5
 
 
 @dataclass(frozen=True)

@@ -15,8 +15,8 @@ from vitamin3d.types import Array, PointCloud
 
 
 @kernel
-def _information(intrinsics, R, t, starts, obs_landmark, obs_valid, obs_pixels, first, points, wanted, H):  # type: ignore[no-untyped-def]
-    """Adds JᵀJ (3, 3) of each counting observation of each wanted landmark to H (L, 3, 3), at its number in `wanted`."""
+def _information(intrinsics, R, t, starts, obs_landmark, obs_valid, obs_pixels, first, points, wanted, H, squared, count):  # type: ignore[no-untyped-def]
+    """Adds JᵀJ (3, 3) and |r|² of each counting observation of each wanted landmark, at its number in `wanted`."""
     r, J_pose, J = np.empty(2), np.empty((2, 6)), np.empty((2, 3))
     for k in range(R.shape[0]):
         for i in range(starts[k], starts[k + 1]):
@@ -25,6 +25,8 @@ def _information(intrinsics, R, t, starts, obs_landmark, obs_valid, obs_pixels, 
             if at < 0 or not obs_valid[i] or i < first[id_]:
                 continue
             if linearize(intrinsics, R[k], t[k], points[id_], obs_pixels[i], r, J_pose, J):
+                squared[at] += r[0] * r[0] + r[1] * r[1]
+                count[at] += 1
                 for m in range(3):
                     for n in range(3):
                         H[at, m, n] += J[0, m] * J[0, n] + J[1, m] * J[1, n]
@@ -77,15 +79,21 @@ def landmark_statistics(sparse_map: SparseMap, camera: Camera) -> LandmarkStatis
 
 def landmark_information(sparse_map: SparseMap, ids: Array, camera: Camera, sigma_px: float) -> Array:
     """Inverse covariance (N, 3, 3) of landmarks (N,) ids, in the world, for observations good to sigma_px."""
+    return _information_and_rms(sparse_map, ids, camera)[0] / sigma_px**2
+
+
+def _information_and_rms(sparse_map: SparseMap, ids: Array, camera: Camera) -> tuple[Array, Array]:
+    """Sums of JᵀJ (N, 3, 3) per landmark and the RMS (N,) of its reprojection errors, pixels."""
     wanted = np.full(len(sparse_map.points_world), -1, np.int64)
     wanted[ids] = np.arange(len(ids))
-    poses, H = sparse_map.T_cam_world, np.zeros((len(ids), 3, 3))
+    poses, H, squared, count = sparse_map.T_cam_world, np.zeros((len(ids), 3, 3)), np.zeros(len(ids)), np.zeros(len(ids), np.int64)
     R, t = np.ascontiguousarray(poses[:, :3, :3]), np.ascontiguousarray(poses[:, :3, 3])
     _information(
         camera.intrinsics, R, t, np.array(sparse_map.keyframe_starts), sparse_map.obs_landmark, sparse_map.obs_valid,
         sparse_map.obs_pixels, sparse_map.first_observation, sparse_map.points_world, wanted, H,
+        squared, count,
     )  # fmt: skip
-    return H / sigma_px**2
+    return H, np.sqrt(squared / np.maximum(count, 1))
 
 
 def relative_depth_deviations(information: Array, points_world: Array, T_cam_world: Array) -> Array:
@@ -114,9 +122,9 @@ def keyframe_vertices(sparse_map: SparseMap, keyframe: int, camera: Camera, conf
     ids = ids[good]
     points, T = sparse_map.points_world[ids], sparse_map.T_cam_world[keyframe]
     in_camera = points @ T[:3, :3].T + T[:3, 3]
-    information = landmark_information(sparse_map, ids, camera, config.observation_sigma_px)
-    deviations = relative_depth_deviations(information, points, T)
-    usable = (in_camera[:, 2] > 0) & (deviations < config.max_relative_deviation)
+    information, rms = _information_and_rms(sparse_map, ids, camera)
+    deviations = relative_depth_deviations(information / config.observation_sigma_px**2, points, T)
+    usable = (in_camera[:, 2] > 0) & (deviations < config.max_relative_deviation) & (rms < config.max_reprojection_rms_px)
     return camera.ideal_from_points(in_camera[usable]), in_camera[usable, 2], deviations[usable]
 
 
