@@ -1,14 +1,27 @@
 # SPDX-License-Identifier: Apache-2.0
 """What all tests share; its presence also puts this folder on the path (`reference`, `reference_dense`, `scenes`)."""
 
+from pathlib import Path
+
 import cv2
 import numpy as np
 import pytest
 import scenes
 from hypothesis import settings
 
+TESTS = Path(__file__).parent
+PACKAGE = TESTS.parent / "vitamin3d"
+
 settings.register_profile("vitamin3d", max_examples=40, deadline=None, derandomize=True, database=None)
 settings.load_profile("vitamin3d")
+
+
+def pytest_configure():
+    """Numba sees when a kernel's own file changes, not when a function that it inlines does: cached kernels older than that go."""
+    newest = max(path.stat().st_mtime for path in PACKAGE.rglob("*.py") if "@inlined" in path.read_text())
+    for index in (*PACKAGE.rglob("*.nbi"), *TESTS.rglob("*.nbi")):
+        if index.stat().st_mtime < newest:
+            index.unlink(missing_ok=True)
 
 
 @pytest.fixture(autouse=True, scope="session")

@@ -252,7 +252,9 @@ def rays_of(sparse_map, id_):
     return rows, [ray / np.linalg.norm(ray) for ray in rays]
 
 
-def test_statistics_equal_their_twin(noisy_map):
+@pytest.mark.parametrize("order", [[0, 1, 2, 3, 4], [0, 4, 2, 3, 1]], ids=["away", "there and back"])
+def test_statistics_equal_their_twin(noisy_map, order):
+    noisy_map.T_cam_world[:] = noisy_map.T_cam_world[order]
     statistics = landmark_statistics(noisy_map, PINHOLE)
     assert len(statistics.num_observations) == 60
     for id_ in range(60):

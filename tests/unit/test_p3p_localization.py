@@ -104,6 +104,13 @@ def test_too_few_landmarks_do_not_converge(rng, count):
     np.testing.assert_array_equal(found.T_cam_world, TRUTH)
 
 
+@pytest.mark.parametrize(("min_ratio", "converges"), [(0.25, False), (0.1, True)])
+def test_a_small_share_of_inliers_does_not_converge(rng, min_ratio, converges):
+    points, pixels, is_outlier = view(rng, 300, 0.85)
+    found = loc.localize(points, pixels, TRUTH, PINHOLE, LocalizationConfig(min_inlier_ratio=min_ratio))
+    assert found.converged == converges and found.is_inlier[~is_outlier].sum() == 45
+
+
 @pytest.mark.parametrize("prior", [None, TRUTH])
 def test_garbage_does_not_converge(rng, prior):
     points, pixels = rng.uniform(-5, 5, (200, 3)), rng.uniform(0, 480, (200, 2))
