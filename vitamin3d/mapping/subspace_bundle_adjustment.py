@@ -24,6 +24,8 @@ STEP_HALVINGS = 3
 FIRST_DAMPING = 1e-4
 MAX_DAMPING = 1e8
 RELATIVE_GAIN = 1e-5
+POINTS_PER_BLOCK = 1024
+"""Points whose part of the reduced camera system is accumulated by one matrix product."""
 
 
 @inlined
@@ -152,17 +154,41 @@ def _sweep_points(intrinsics, R, t, points, point_starts, point_order, obs_camer
             delta *= 0.5
 
 
+@inlined
+def _inverse_root_3x3(H, L):  # type: ignore[no-untyped-def]
+    """L upper triangular (3, 3) with H⁻¹ = L Lᵀ, by the Cholesky factor of H; False where H is singular."""
+    if not H[0, 0] > 0.0:
+        return False
+    c00 = np.sqrt(H[0, 0])
+    c10, c20 = H[1, 0] / c00, H[2, 0] / c00
+    d11 = H[1, 1] - c10 * c10
+    if not d11 > 1e-14 * H[1, 1]:
+        return False
+    c11 = np.sqrt(d11)
+    c21 = (H[2, 1] - c20 * c10) / c11
+    d22 = H[2, 2] - c20 * c20 - c21 * c21
+    if not d22 > 1e-14 * H[2, 2]:
+        return False
+    c22 = np.sqrt(d22)
+    L[0, 0], L[1, 1], L[2, 2] = 1.0 / c00, 1.0 / c11, 1.0 / c22
+    L[0, 1] = -c10 / (c00 * c11)
+    L[1, 2] = -c21 / (c11 * c22)
+    L[0, 2] = (c10 * c21 - c20 * c11) / (c00 * c11 * c22)
+    L[1, 0] = L[2, 0] = L[2, 1] = 0.0
+    return True
+
+
 @kernel
-def _reduced_system(  # type: ignore[no-untyped-def]
+def _linearize_points(  # type: ignore[no-untyped-def]
     intrinsics, R, t, free_index, points, point_starts, point_order, obs_camera, obs_pixels,
-    squared_sigma, damping, S, b, W, H_inverse, g_points,
+    squared_sigma, damping, first, last, H_cameras, b, W, L, g_points, A,
 ):  # fmt: skip
-    """Eq. 9: the Schur complement S (F, F, 6, 6), upper blocks, and its right side b (F, 6); W, H⁻¹ and g for Eq. 10."""
-    r, J, Jp = np.empty(2), np.empty((2, 6)), np.empty((2, 3))
-    H, Y, unit, column = np.empty((3, 3)), np.empty((6, 3)), np.empty(3), np.empty(3)
-    for p in range(points.shape[0]):
+    """Points first..last of Eq. 9: camera blocks H_cameras (F, 6, 6) and b (F, 6); per observation W = H_cp (6, 3); per
+    point its gradient g, H_pp⁻¹ = L Lᵀ, and the columns W L of A (6 F, 3 (last - first)), so that A Aᵀ is H_cp H_pp⁻¹ H_cpᵀ."""
+    r, J, Jp, H = np.empty(2), np.empty((2, 6)), np.empty((2, 3)), np.empty((3, 3))
+    A[:, :] = 0.0
+    for p in range(first, last):
         rows = point_order[point_starts[p] : point_starts[p + 1]]
-        is_fixed = rows.shape[0] < 2
         H[:, :] = 0.0
         g_points[p, :] = 0.0
         for i in rows:
@@ -181,45 +207,26 @@ def _reduced_system(  # type: ignore[no-untyped-def]
             for m in range(6):
                 b[f, m] -= w * (J[0, m] * r[0] + J[1, m] * r[1])
                 for n in range(6):
-                    S[f, f, m, n] += w * (J[0, m] * J[0, n] + J[1, m] * J[1, n])
+                    H_cameras[f, m, n] += w * (J[0, m] * J[0, n] + J[1, m] * J[1, n])
                 for n in range(3):
                     W[i, m, n] = w * (J[0, m] * Jp[0, n] + J[1, m] * Jp[1, n])
-            S_scale = damping * w
-            for m in range(6):
-                S[f, f, m, m] += S_scale * (J[0, m] * J[0, m] + J[1, m] * J[1, m])
-        H_inverse[p] = 0.0
-        if is_fixed:
-            g_points[p, :] = 0.0
-            continue
         for m in range(3):
             H[m, m] *= 1.0 + damping
-        for m in range(3):
-            unit[:] = 0.0
-            unit[m] = -1.0
-            if _solve_3x3(H, unit, column):
-                H_inverse[p, m] = column
-        for i_at in range(rows.shape[0]):
-            i = rows[i_at]
+        if rows.shape[0] < 2 or not _inverse_root_3x3(H, L[p]):
+            L[p] = 0.0
+            continue
+        for i in rows:
             f = free_index[obs_camera[i]]
-            if f < 0:
-                continue
-            for m in range(6):
-                for n in range(3):
-                    Y[m, n] = W[i, m, 0] * H_inverse[p, 0, n] + W[i, m, 1] * H_inverse[p, 1, n] + W[i, m, 2] * H_inverse[p, 2, n]
-                b[f, m] += Y[m, 0] * g_points[p, 0] + Y[m, 1] * g_points[p, 1] + Y[m, 2] * g_points[p, 2]
-            for j_at in range(i_at, rows.shape[0]):
-                j = rows[j_at]
-                f2 = free_index[obs_camera[j]]
-                if f2 < 0:
-                    continue
-                block = S[f, f2]
+            if f >= 0:
+                column = 3 * (p - first)
                 for m in range(6):
-                    for n in range(6):
-                        block[m, n] -= Y[m, 0] * W[j, n, 0] + Y[m, 1] * W[j, n, 1] + Y[m, 2] * W[j, n, 2]
+                    A[6 * f + m, column] += W[i, m, 0] * L[p, 0, 0]
+                    A[6 * f + m, column + 1] += W[i, m, 0] * L[p, 0, 1] + W[i, m, 1] * L[p, 1, 1]
+                    A[6 * f + m, column + 2] += W[i, m, 0] * L[p, 0, 2] + W[i, m, 1] * L[p, 1, 2] + W[i, m, 2] * L[p, 2, 2]
 
 
 @kernel
-def _back_substitute(delta, free_index, points, point_starts, point_order, obs_camera, W, H_inverse, g_points, out):  # type: ignore[no-untyped-def]
+def _back_substitute(delta, free_index, points, point_starts, point_order, obs_camera, W, L, g_points, out):  # type: ignore[no-untyped-def]
     """Eq. 10: the points' steps from the cameras' steps delta (F, 6); out = points + steps."""
     rhs = np.empty(3)
     for p in range(points.shape[0]):
@@ -231,8 +238,12 @@ def _back_substitute(delta, free_index, points, point_starts, point_order, obs_c
                 for n in range(3):
                     for m in range(6):
                         rhs[n] += W[i, m, n] * delta[f, m]
-        for n in range(3):
-            out[p, n] = points[p, n] - (H_inverse[p, n, 0] * rhs[0] + H_inverse[p, n, 1] * rhs[1] + H_inverse[p, n, 2] * rhs[2])
+        x = L[p, 0, 0] * rhs[0]
+        y = L[p, 0, 1] * rhs[0] + L[p, 1, 1] * rhs[1]
+        z = L[p, 0, 2] * rhs[0] + L[p, 1, 2] * rhs[1] + L[p, 2, 2] * rhs[2]
+        out[p, 0] = points[p, 0] - (L[p, 0, 0] * x + L[p, 0, 1] * y + L[p, 0, 2] * z)
+        out[p, 1] = points[p, 1] - (L[p, 1, 1] * y + L[p, 1, 2] * z)
+        out[p, 2] = points[p, 2] - L[p, 2, 2] * z
 
 
 @kernel
@@ -328,28 +339,34 @@ def adjust_schur(problem: BundleProblem, camera: Camera, sigma_px: float, iterat
 
 def _schur_step(s: _State, free_index: Array, damping: float) -> tuple[Array, Array, Array]:
     """One damped step of all variables: new R (C, 3, 3), t (C, 3), points (P, 3)."""
-    p, F = s.problem, int(free_index.max(initial=-1)) + 1
-    S, b = np.zeros((F, F, 6, 6)), np.zeros((F, 6))
-    W, H_inverse, g_points = np.empty((len(p.obs_camera), 6, 3)), np.empty((len(s.points), 3, 3)), np.empty((len(s.points), 3))
-    _reduced_system(
-        s.intrinsics, s.R, s.t, free_index, s.points, p.point_starts, p.point_order, p.obs_camera, p.obs_pixels,
-        s.squared_sigma, damping, S, b, W, H_inverse, g_points,
-    )  # fmt: skip
-    delta = _solve_cameras(S, b)
+    p, num_points = s.problem, len(s.points)
+    F = int(free_index.max(initial=-1)) + 1
+    H_cameras, b, reduced = np.zeros((F, 6, 6)), np.zeros((F, 6)), np.zeros((6 * F, 6 * F))
+    W, L, g_points = np.empty((len(p.obs_camera), 6, 3)), np.empty((num_points, 3, 3)), np.empty((num_points, 3))
+    for first in range(0, num_points, POINTS_PER_BLOCK):
+        last = min(num_points, first + POINTS_PER_BLOCK)
+        A = np.empty((6 * F, 3 * (last - first)))
+        _linearize_points(
+            s.intrinsics, s.R, s.t, free_index, s.points, p.point_starts, p.point_order, p.obs_camera, p.obs_pixels,
+            s.squared_sigma, damping, first, last, H_cameras, b, W, L, g_points, A,
+        )  # fmt: skip
+        reduced -= A @ A.T
+        b += (A @ np.einsum("pji,pj->pi", L[first:last], g_points[first:last]).ravel()).reshape(F, 6)
+    delta = _solve_cameras(reduced, H_cameras, b, damping)
     R, t, points = np.empty_like(s.R), np.empty_like(s.t), np.empty_like(s.points)
     _retract_all(delta, free_index, s.R, s.t, R, t)
-    _back_substitute(delta, free_index, s.points, p.point_starts, p.point_order, p.obs_camera, W, H_inverse, g_points, points)
+    _back_substitute(delta, free_index, s.points, p.point_starts, p.point_order, p.obs_camera, W, L, g_points, points)
     return R, t, points
 
 
-def _solve_cameras(S: Array, b: Array) -> Array:
-    """Steps (F, 6) of the cameras from the upper blocks S (F, F, 6, 6) and b (F, 6)."""
+def _solve_cameras(reduced: Array, H_cameras: Array, b: Array, damping: float) -> Array:
+    """Steps (F, 6) of the cameras (Eq. 9); `reduced` (6 F, 6 F) is -H_cp H_pp⁻¹ H_cpᵀ, H_cameras (F, 6, 6) the blocks of H_cc."""
     F = len(b)
-    matrix = S.transpose(0, 2, 1, 3).reshape(6 * F, 6 * F)
-    upper = np.triu(matrix)
-    matrix = upper + np.triu(matrix, 1).T
-    scale = 1.0 / np.sqrt(np.maximum(np.diag(matrix), 1e-12))
-    scaled = matrix * scale[:, None] * scale[None, :] + 1e-12 * np.eye(6 * F)
+    for f in range(F):
+        block = H_cameras[f] + damping * np.diag(np.diag(H_cameras[f]))
+        reduced[6 * f : 6 * f + 6, 6 * f : 6 * f + 6] += block
+    scale = 1.0 / np.sqrt(np.maximum(np.diag(reduced), 1e-12))
+    scaled = reduced * scale[:, None] * scale[None, :] + 1e-12 * np.eye(6 * F)
     return np.asarray((scale * np.linalg.solve(scaled, scale * b.ravel())).reshape(F, 6)) if F else np.zeros((0, 6))
 
 
