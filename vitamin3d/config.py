@@ -165,6 +165,10 @@ class BundleAdjustmentConfig:
     keyframe_solver: str = "schur"
     """Solver of the window at each keyframe: `schur` (Levenberg–Marquardt, reduced camera system) or `subspace`."""
     keyframe_iterations: int = 6
+    relative_gain: float = 1e-3
+    """An adjustment ends when a step lowers the cost by less than this share."""
+    frame_keyframes: int = 4
+    """Keyframes that are adjusted with every frame; those of the window before them are their anchors."""
     outlier_px: float = 5.0
 
 

@@ -21,7 +21,7 @@ from vitamin3d.mapping.pose_log import PoseLog
 from vitamin3d.mapping.sparse_map import SparseMap
 from vitamin3d.mapping.subspace_bundle_adjustment import adjust_bundle, adjust_subspace, squared_reprojection_errors
 from vitamin3d.mapping.two_view_initialization import initialize_from_two_views
-from vitamin3d.mapping.window_selection import BundleProblem, Window, build_problem, select_window, store_solution
+from vitamin3d.mapping.window_selection import BundleProblem, Window, build_problem, select_frame_window, select_window, store_solution
 from vitamin3d.tracking.extrema import refine_extrema, select_free_extrema
 from vitamin3d.tracking.extrema_tracking import predict_by_dense_flow, predict_by_dominant_flow, track_extrema
 from vitamin3d.types import Array, Frame, FrontEndFrame, MapSnapshot, SlamState, StepTimes, Tracks, Trajectory
@@ -205,14 +205,14 @@ class Slam:
         self.tracks = self.tracks.select(~np.isin(self.tracks.ids, ended))
 
     def _adjust_with_frame(self, T_cam_world: Array) -> Array:
-        """A few sweeps of subspace Gauss–Newton over the window and the newest frame; the frame's pose."""
+        """A few sweeps of subspace Gauss–Newton over the newest frame, keyframes and landmarks; the frame's pose."""
         adjustment = self.config.bundle_adjustment
         if adjustment.sweeps_per_frame == 0:
             return T_cam_world
         with self._timed("bundle_adjustment_frame"):
             seen, pixels = self._seen()
             mapped = self.map.is_mapped(seen.ids)
-            window = select_window(self.map, self.config.window)
+            window = select_frame_window(self.map, adjustment.frame_keyframes, self.config.window.keyframes)
             problem = build_problem(self.map, window, (T_cam_world, seen.ids[mapped], pixels[mapped]))
             solved, _ = adjust_subspace(problem, self.camera, adjustment.sigma_px, adjustment.sweeps_per_frame)
             store_solution(self.map, window, solved)

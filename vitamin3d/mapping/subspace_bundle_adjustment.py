@@ -23,7 +23,6 @@ BLOCK_DAMPING = 1e-9
 STEP_HALVINGS = 3
 FIRST_DAMPING = 1e-4
 MAX_DAMPING = 1e8
-RELATIVE_GAIN = 1e-5
 POINTS_PER_BLOCK = 1024
 """Points whose part of the reduced camera system is accumulated by one matrix product."""
 
@@ -294,11 +293,13 @@ def _report(solved: BundleProblem, camera: Camera, costs: list[float], converged
     return BundleReport(np.array(costs), converged, len(e), rmse)
 
 
-def adjust_subspace(problem: BundleProblem, camera: Camera, sigma_px: float, sweeps: int) -> tuple[BundleProblem, BundleReport]:
+def adjust_subspace(
+    problem: BundleProblem, camera: Camera, sigma_px: float, sweeps: int, relative_gain: float = 1e-5
+) -> tuple[BundleProblem, BundleReport]:
     """Subspace Gauss–Newton: sweeps over all free cameras (Eq. 11) and then all points (Eq. 12); the cost never rises.
 
     Returns:
-        The solved problem, and a report with the cost after each sweep.
+        The solved problem, and a report with the cost after each sweep; it ends when a sweep gains less than relative_gain.
     """
     s, p = _State(problem, camera, sigma_px), problem
     costs = [s.cost(s.R, s.t, s.points)]
@@ -306,13 +307,15 @@ def adjust_subspace(problem: BundleProblem, camera: Camera, sigma_px: float, swe
         _sweep_cameras(s.intrinsics, s.R, s.t, p.camera_is_free, s.camera_starts, s.points, p.obs_point, p.obs_pixels, s.squared_sigma)
         _sweep_points(s.intrinsics, s.R, s.t, s.points, p.point_starts, p.point_order, p.obs_camera, p.obs_pixels, s.squared_sigma)
         costs.append(s.cost(s.R, s.t, s.points))
-        if costs[-2] - costs[-1] <= RELATIVE_GAIN * costs[-2]:
+        if costs[-2] - costs[-1] <= relative_gain * costs[-2]:
             break
     solved = s.result()
-    return solved, _report(solved, camera, costs, costs[-2] - costs[-1] <= RELATIVE_GAIN * costs[-2] if sweeps else False, sigma_px)
+    return solved, _report(solved, camera, costs, costs[-2] - costs[-1] <= relative_gain * costs[-2] if sweeps else False, sigma_px)
 
 
-def adjust_schur(problem: BundleProblem, camera: Camera, sigma_px: float, iterations: int) -> tuple[BundleProblem, BundleReport]:
+def adjust_schur(
+    problem: BundleProblem, camera: Camera, sigma_px: float, iterations: int, relative_gain: float = 1e-5
+) -> tuple[BundleProblem, BundleReport]:
     """Levenberg–Marquardt with the points eliminated (Eq. 9–10); the cost never rises.
 
     Returns:
@@ -328,7 +331,7 @@ def adjust_schur(problem: BundleProblem, camera: Camera, sigma_px: float, iterat
         costs.append(min(cost, costs[-1]))
         if accepted:
             s.R, s.t, s.points, damping = R, t, points, max(1e-8, 0.1 * damping)
-            converged = costs[-2] - cost <= RELATIVE_GAIN * cost
+            converged = costs[-2] - cost <= relative_gain * cost
         else:
             damping *= 10.0
         if converged or damping > MAX_DAMPING:
@@ -373,5 +376,5 @@ def _solve_cameras(reduced: Array, H_cameras: Array, b: Array, damping: float) -
 def adjust_bundle(problem: BundleProblem, camera: Camera, config: BundleAdjustmentConfig) -> tuple[BundleProblem, BundleReport]:
     """The window's adjustment at a keyframe, by the solver that the settings name."""
     if config.keyframe_solver == "schur":
-        return adjust_schur(problem, camera, config.sigma_px, config.keyframe_iterations)
-    return adjust_subspace(problem, camera, config.sigma_px, config.keyframe_iterations)
+        return adjust_schur(problem, camera, config.sigma_px, config.keyframe_iterations, config.relative_gain)
+    return adjust_subspace(problem, camera, config.sigma_px, config.keyframe_iterations, config.relative_gain)

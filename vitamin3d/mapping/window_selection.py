@@ -114,6 +114,14 @@ def select_window(sparse_map: SparseMap, config: WindowConfig) -> Window:
     return Window(np.concatenate([recent, anchors]), len(recent), fixed)
 
 
+def select_frame_window(sparse_map: SparseMap, adjusted: int, size: int) -> Window:
+    """The window of an ordinary frame: the newest keyframes, anchored to those just before them, `size` in all."""
+    count = sparse_map.num_keyframes
+    oldest, first = max(0, count - size), max(0, count - adjusted)
+    keyframes = np.concatenate([np.arange(first, count), np.arange(oldest, first)])
+    return Window(keyframes, count - first, 0 if oldest < first else min(1, count - 1))
+
+
 def _anchors(sparse_map: SparseMap, oldest: int, config: WindowConfig) -> Array:
     starts = np.array(sparse_map.keyframe_starts)
     marked = np.zeros(len(sparse_map.points_world), np.bool_)
