@@ -241,6 +241,8 @@ class FusionConfig:
     voxel_high: float | None = None
     depth_per_voxel_low: float = 20.0
     depth_per_voxel_high: float = 120.0
+    keyframes_for_depth: int = 30
+    """Keyframes whose depths decide the voxels; fusion waits for them where the voxels are not given."""
     truncation_voxels: float = 4.0
     max_depth: float = 3.0
     """Depth beyond this many median depths of the scene is not fused."""

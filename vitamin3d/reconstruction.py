@@ -1,6 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """The dense half of VITAMIN-E (Sec. 4.2): keyframes with landmark depths -> meshes in the image -> TSDF -> surface."""
 
+import dataclasses
 import time
 from collections.abc import Iterator
 from contextlib import contextmanager
@@ -17,6 +18,9 @@ from vitamin3d.dense.tsdf_fusion import TsdfVolume, empty_surface
 from vitamin3d.geometry.camera import Camera
 from vitamin3d.types import DepthView, MapSnapshot, StepTimes, Surface
 
+NO_NORMALS = np.zeros((0, 0, 3), np.float32)
+"""Fusion needs depth and colour; the normals of waiting views are not kept."""
+
 
 class Reconstruction:
     """Turns keyframes into a coarse and a fine surface.
@@ -32,6 +36,7 @@ class Reconstruction:
         self.times = times if times is not None else StepTimes()
         self.renderer = DepthRenderer(camera, config.depth_rendering)
         self.median_depths: list[float] = []
+        self._waiting: list[DepthView] = []
         self.low: TsdfVolume | None = None
         self.high: TsdfVolume | None = None
 
@@ -51,11 +56,14 @@ class Reconstruction:
         with self._timed("rendering"):
             view = self.renderer.render(snapshot, denoised.mesh, denoised.slopes)
         self.median_depths.append(float(np.median(1.0 / mesh.inverse_depth)))
-        self._fuse(view)
+        self._waiting.append(dataclasses.replace(view, normals_cam=NO_NORMALS))
+        if self._voxels_are_known or len(self._waiting) >= self.config.fusion.keyframes_for_depth:
+            self._fuse_waiting()
         return view
 
     def surfaces(self) -> tuple[Surface, Surface]:
         """The coarse and the fine surface of all keyframes so far."""
+        self._fuse_waiting()
         with self._timed("surface_low"):
             low = self._surface(self.low)
         with self._timed("surface_high"):
@@ -63,9 +71,21 @@ class Reconstruction:
         return low, high
 
     def voxel_lengths(self) -> tuple[float, float]:
-        """Sides of the coarse and the fine voxels in map units: as configured, or fractions of the first keyframe's median depth."""
-        fusion, depth = self.config.fusion, self.median_depths[0]
+        """Sides of the coarse and the fine voxels in map units: as configured, or fractions of the scene's median depth."""
+        fusion = self.config.fusion
+        depth = float(np.median(self.median_depths[: fusion.keyframes_for_depth]))
         return fusion.voxel_low or depth / fusion.depth_per_voxel_low, fusion.voxel_high or depth / fusion.depth_per_voxel_high
+
+    @property
+    def _voxels_are_known(self) -> bool:
+        fusion = self.config.fusion
+        return self.low is not None or (fusion.voxel_low is not None and fusion.voxel_high is not None)
+
+    def _fuse_waiting(self) -> None:
+        """Fuses the keyframes that waited until enough of the scene was seen to choose the voxels by its depth."""
+        for view in self._waiting:
+            self._fuse(view)
+        self._waiting.clear()
 
     def _fuse(self, view: DepthView) -> None:
         if self.low is None or self.high is None:
