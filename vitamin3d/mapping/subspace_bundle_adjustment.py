@@ -180,13 +180,14 @@ def _inverse_root_3x3(H, L):  # type: ignore[no-untyped-def]
 @kernel
 def _linearize_points(  # type: ignore[no-untyped-def]
     intrinsics, R, t, free_index, points, point_starts, point_order, obs_camera, obs_pixels,
-    squared_sigma, damping, first, last, H_cameras, b, W, L, g_points, A,
+    squared_sigma, damping, block, block_row, H_cameras, b, W, L, g_points, A,
 ):  # fmt: skip
-    """Points first..last of Eq. 9: camera blocks H_cameras (F, 6, 6) and b (F, 6); per observation W = H_cp (6, 3); per
-    point its gradient g, H_pp⁻¹ = L Lᵀ, and the columns W L of A (6 F, 3 (last - first)), so that A Aᵀ is H_cp H_pp⁻¹ H_cpᵀ."""
+    """The points `block` of Eq. 9: camera blocks H_cameras (F, 6, 6) and b (F, 6); per observation W = H_cp (6, 3); per point
+    its gradient g, H_pp⁻¹ = L Lᵀ, and the columns W L of A, whose rows 6 block_row[f].. are camera f: A Aᵀ is H_cp H_pp⁻¹ H_cpᵀ."""
     r, J, Jp, H = np.empty(2), np.empty((2, 6)), np.empty((2, 3)), np.empty((3, 3))
     A[:, :] = 0.0
-    for p in range(first, last):
+    for k in range(block.shape[0]):
+        p = block[k]
         rows = point_order[point_starts[p] : point_starts[p + 1]]
         H[:, :] = 0.0
         g_points[p, :] = 0.0
@@ -217,11 +218,11 @@ def _linearize_points(  # type: ignore[no-untyped-def]
         for i in rows:
             f = free_index[obs_camera[i]]
             if f >= 0:
-                column = 3 * (p - first)
+                row = 6 * block_row[f]
                 for m in range(6):
-                    A[6 * f + m, column] += W[i, m, 0] * L[p, 0, 0]
-                    A[6 * f + m, column + 1] += W[i, m, 0] * L[p, 0, 1] + W[i, m, 1] * L[p, 1, 1]
-                    A[6 * f + m, column + 2] += W[i, m, 0] * L[p, 0, 2] + W[i, m, 1] * L[p, 1, 2] + W[i, m, 2] * L[p, 2, 2]
+                    A[row + m, 3 * k] += W[i, m, 0] * L[p, 0, 0]
+                    A[row + m, 3 * k + 1] += W[i, m, 0] * L[p, 0, 1] + W[i, m, 1] * L[p, 1, 1]
+                    A[row + m, 3 * k + 2] += W[i, m, 0] * L[p, 0, 2] + W[i, m, 1] * L[p, 1, 2] + W[i, m, 2] * L[p, 2, 2]
 
 
 @kernel
@@ -269,6 +270,21 @@ class _State:
     def cost(self, R: Array, t: Array, points: Array) -> float:
         p = self.problem
         return float(_total_cost(self.intrinsics, R, t, points, p.obs_camera, p.obs_point, p.obs_pixels, self.squared_sigma))
+
+    def point_blocks(self, free_index: Array) -> list[tuple[Array, Array]]:
+        """Points in blocks that share cameras, by the first that sees them, each with the free cameras (by index) that see it."""
+        p = self.problem
+        seen = p.point_starts[1:] > p.point_starts[:-1]
+        first = np.full(len(self.points), len(self.R))
+        first[seen] = p.obs_camera[p.point_order[p.point_starts[:-1][seen]]]
+        order = np.argsort(first, kind="stable")
+        block_of_point = np.empty(len(order), np.int64)
+        block_of_point[order] = np.arange(len(order)) // POINTS_PER_BLOCK
+        is_free = free_index[p.obs_camera] >= 0
+        sees = np.zeros((len(order) // POINTS_PER_BLOCK + 1, int(free_index.max(initial=-1)) + 1), np.bool_)
+        sees[block_of_point[p.obs_point[is_free]], free_index[p.obs_camera[is_free]]] = True
+        blocks = [order[k : k + POINTS_PER_BLOCK] for k in range(0, len(order), POINTS_PER_BLOCK)]
+        return [(block, np.flatnonzero(sees[k])) for k, block in enumerate(blocks)]
 
     def result(self) -> BundleProblem:
         U, _, Vt = np.linalg.svd(self.R)
@@ -346,15 +362,17 @@ def _schur_step(s: _State, free_index: Array, damping: float) -> tuple[Array, Ar
     F = int(free_index.max(initial=-1)) + 1
     H_cameras, b, reduced = np.zeros((F, 6, 6)), np.zeros((F, 6)), np.zeros((6 * F, 6 * F))
     W, L, g_points = np.empty((len(p.obs_camera), 6, 3)), np.empty((num_points, 3, 3)), np.empty((num_points, 3))
-    for first in range(0, num_points, POINTS_PER_BLOCK):
-        last = min(num_points, first + POINTS_PER_BLOCK)
-        A = np.empty((6 * F, 3 * (last - first)))
+    for block, cameras in s.point_blocks(free_index):
+        block_row = np.full(F, -1)
+        block_row[cameras] = np.arange(len(cameras))
+        A = np.empty((6 * len(cameras), 3 * len(block)))
         _linearize_points(
             s.intrinsics, s.R, s.t, free_index, s.points, p.point_starts, p.point_order, p.obs_camera, p.obs_pixels,
-            s.squared_sigma, damping, first, last, H_cameras, b, W, L, g_points, A,
+            s.squared_sigma, damping, block, block_row, H_cameras, b, W, L, g_points, A,
         )  # fmt: skip
-        reduced -= A @ A.T
-        b += (A @ np.einsum("pji,pj->pi", L[first:last], g_points[first:last]).ravel()).reshape(F, 6)
+        rows = (6 * cameras[:, None] + np.arange(6)).ravel()
+        reduced[np.ix_(rows, rows)] -= A @ A.T
+        b[cameras] += (A @ np.einsum("pji,pj->pi", L[block], g_points[block]).ravel()).reshape(-1, 6)
     delta = _solve_cameras(reduced, H_cameras, b, damping)
     R, t, points = np.empty_like(s.R), np.empty_like(s.t), np.empty_like(s.points)
     _retract_all(delta, free_index, s.R, s.t, R, t)
