@@ -28,14 +28,16 @@ def main(argv: list[str] | None = None) -> int:
             print(f"skipped {frame.path}: {frame.reason}", file=sys.stderr)
             continue
         slam.process_frame(front_end.process(frame))
-        for keyframe, picture in slam.take_settled_keyframes():  # those that the adjustment will not move any more
-            reconstruction.add_keyframe(slam.snapshot(keyframe, picture))
-    for keyframe, picture in slam.take_settled_keyframes(everything=True):
-        reconstruction.add_keyframe(slam.snapshot(keyframe, picture))
-
     if slam.map.num_keyframes == 0:
         print(f"no map: {slam.initialization_reason}", file=sys.stderr)
         return 3
+    slam.finish()  # adjusts the whole map once more
+
+    for keyframe, index in enumerate(slam.map.frame_indices):
+        frame = dataset.read(index)
+        if not isinstance(frame, Unreadable):
+            reconstruction.add_keyframe(slam.snapshot(keyframe, frame))
+
     output.write_config(config)
     output.write_trajectories(slam.trajectory(), slam.keyframe_trajectory(), scale)
     output.write_cloud(point_cloud(slam.map, dataset.camera, config.cloud, config.snapshot.observation_sigma_px), scale, "")

@@ -49,6 +49,7 @@ def reconstruct(
     voxel_high: Annotated[float | None, typer.Option(help="Fine voxels, metres; needs a scale.")] = None,
     metric_scale: Annotated[float | None, typer.Option(help="Metres per map unit.")] = None,
     scale_from_ground_truth: Annotated[bool, typer.Option("--scale-from-ground-truth", help="Take the scale from it.")] = False,
+    live: Annotated[bool, typer.Option("--live", help="Fuse while tracking, without the final adjustment of the map before.")] = False,
     save_tracks: Annotated[bool, typer.Option("--save-tracks", help="Also write tracks.npz.")] = False,
     overwrite: Annotated[bool, typer.Option("--overwrite", help="Replace an earlier result.")] = False,
     quiet: Annotated[bool, typer.Option("--quiet", "-q", help="Warnings and the result only.")] = False,
@@ -64,6 +65,7 @@ def reconstruct(
         metric_scale,
         scale_from_ground_truth,
         save_tracks,
+        live,
     )
     try:
         code = _run(source, calibration, job, out, overwrite, quiet)

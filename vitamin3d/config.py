@@ -173,6 +173,19 @@ class BundleAdjustmentConfig:
 
 
 @dataclass(frozen=True)
+class FinalAdjustmentConfig:
+    """The adjustment of the whole map at the end: a round as in the windows, and a stricter one; outliers removed after each."""
+
+    enabled: bool = True
+    sigma_px: float = 1.0
+    outlier_px: float = 3.0
+    iterations: int = 6
+    relative_gain: float = 1e-3
+    max_keyframes: int = 1000
+    """Longer maps are left as they are: the reduced camera system grows with the square of the keyframes."""
+
+
+@dataclass(frozen=True)
 class CloudConfig:
     """Filter of the exported cloud."""
 
@@ -273,6 +286,7 @@ class Config:
     recovery: RecoveryConfig = field(default_factory=RecoveryConfig)
     window: WindowConfig = field(default_factory=WindowConfig)
     bundle_adjustment: BundleAdjustmentConfig = field(default_factory=BundleAdjustmentConfig)
+    final_adjustment: FinalAdjustmentConfig = field(default_factory=FinalAdjustmentConfig)
     cloud: CloudConfig = field(default_factory=CloudConfig)
     snapshot: SnapshotConfig = field(default_factory=SnapshotConfig)
     delaunay: DelaunayConfig = field(default_factory=DelaunayConfig)
@@ -291,6 +305,7 @@ def paper_config() -> Config:
         localization=LocalizationConfig(prior_inlier_ratio=2.0),
         recovery=RecoveryConfig(enabled=False),
         window=WindowConfig(anchors=0),
+        final_adjustment=FinalAdjustmentConfig(enabled=False),
         bundle_adjustment=BundleAdjustmentConfig(keyframe_solver="subspace", keyframe_iterations=20),
     )
 

@@ -2,6 +2,7 @@
 """The whole job: a sequence in, an output folder with trajectory, cloud, meshes and maps out."""
 
 import dataclasses
+from collections.abc import Iterator
 from dataclasses import dataclass
 from typing import Any
 
@@ -13,11 +14,11 @@ from vitamin3d.exporters.output_folder import OutputFolder
 from vitamin3d.mapping.landmark_statistics import point_cloud
 from vitamin3d.reconstruction import Reconstruction
 from vitamin3d.run_statistics import Stopwatch, run_statistics
-from vitamin3d.runtime import Observer, RunRecord, run_sequential, run_threaded
+from vitamin3d.runtime import Observer, RunRecord, run_ahead, run_sequential, run_threaded
 from vitamin3d.scale import Scale, scale_from_ground_truth
 from vitamin3d.slam import Slam
 from vitamin3d.tracking.front_end import FrontEnd
-from vitamin3d.types import MapSnapshot
+from vitamin3d.types import DepthView, MapSnapshot
 
 VOXEL_LOW_M, VOXEL_HIGH_M = 0.15, 0.025
 """Table 3 of the paper; the defaults where the scale is known."""
@@ -51,6 +52,8 @@ class Job:
     """Metres per map unit, where the caller knows."""
     scale_from_truth: bool = False
     save_tracks: bool = False
+    live: bool = False
+    """Keyframes are fused while the camera is tracked; else after the final adjustment of the map."""
 
 
 @dataclass(frozen=True)
@@ -75,21 +78,20 @@ def reconstruct_sequence(dataset: Dataset, job: Job, output: OutputFolder, obser
         OutputError: a file cannot be written.
     """
     watch, indices = Stopwatch(), job.selection.indices(len(dataset))
-    if job.scale_from_truth and dataset.ground_truth() is None:
-        raise InputError(f"{dataset.name}: --scale-from-ground-truth, but the source has no ground truth; use --metric-scale")
+    _check_scale_source(dataset, job)
     front_end, slam = FrontEnd(job.config), Slam(dataset.camera, job.config)
     scale = Scale(job.metric_scale, "given") if job.metric_scale else Scale()
     dense = _Dense(dataset, job, output, scale)
     run = run_threaded if job.threads else run_sequential
-    sink = None if job.scale_from_truth else dense.add
     try:
-        record = run(dataset, indices, front_end, slam, sink, observer, job.save_tracks)
+        record = run(dataset, indices, front_end, slam, dense.add if job.live else None, observer, job.save_tracks)
     except Exception:
         _write_sparse(slam, scale, output, job)
         dense.write_surfaces()
         raise
-    if job.scale_from_truth and slam.map.num_keyframes:
-        dense.scale = scale = scale_from_ground_truth(slam.trajectory(), dataset.ground_truth())
+    slam.finish()
+    if slam.map.num_keyframes and not job.live:
+        dense.scale = scale = scale_from_ground_truth(slam.trajectory(), dataset.ground_truth()) if job.scale_from_truth else scale
         dense.add_all(slam, observer)
     cloud_points = _write_sparse(slam, scale, output, job)
     dense.write_surfaces()
@@ -100,6 +102,14 @@ def reconstruct_sequence(dataset: Dataset, job: Job, output: OutputFolder, obser
     stats |= {"source": dataset.name, "mode": job.config.mode, "voxels": dense.voxels(), "skipped": [_line(s) for s in record.skipped]}
     output.write_stats(stats)
     return Outcome(slam, record, scale, stats)
+
+
+def _check_scale_source(dataset: Dataset, job: Job) -> None:
+    """InputError where the scale is to come from a ground truth that is not there, or not there in time."""
+    if job.scale_from_truth and dataset.ground_truth() is None:
+        raise InputError(f"{dataset.name}: --scale-from-ground-truth, but the source has no ground truth; use --metric-scale")
+    if job.scale_from_truth and job.live:
+        raise InputError("--scale-from-ground-truth needs the whole trajectory before anything is fused; leave --live out")
 
 
 def _line(skipped: Unreadable) -> str:
@@ -131,20 +141,30 @@ class _Dense:
 
     def add(self, snapshot: MapSnapshot) -> None:
         """Fuses a keyframe and writes its maps."""
-        if self.reconstruction is None:
-            self.reconstruction = Reconstruction(self.dataset.camera, with_voxels(self.job.config, self.scale))
-            self.output.write_canvas(self.reconstruction.canvas, self.scale)
-        view = self.reconstruction.add_keyframe(snapshot)
+        view = self._begun().add_keyframe(snapshot)
         if view is not None:
             self.output.write_view(view, self.scale)
 
     def add_all(self, slam: Slam, observer: Observer) -> None:
-        """All keyframes of a finished map, their pictures read again."""
+        """All keyframes of a finished map, their pictures read again; the views are computed ahead of the fusion."""
+        views = self._views(slam)
+        for done, view in enumerate(run_ahead(views) if self.job.threads else views, 1):
+            if view is not None:
+                self._begun().fuse(view)
+                self.output.write_view(view, self.scale)
+            observer.keyframe_done(done, slam.map.num_keyframes)
+
+    def _views(self, slam: Slam) -> Iterator[DepthView | None]:
+        reconstruction = self._begun()
         for keyframe, frame_index in enumerate(slam.map.frame_indices):
             frame = self.dataset.read(frame_index)
-            if not isinstance(frame, Unreadable):
-                self.add(slam.snapshot(keyframe, frame))
-            observer.keyframe_done(keyframe + 1, slam.map.num_keyframes)
+            yield None if isinstance(frame, Unreadable) else reconstruction.depth_view(slam.snapshot(keyframe, frame))
+
+    def _begun(self) -> Reconstruction:
+        if self.reconstruction is None:
+            self.reconstruction = Reconstruction(self.dataset.camera, with_voxels(self.job.config, self.scale))
+            self.output.write_canvas(self.reconstruction.canvas, self.scale)
+        return self.reconstruction
 
     def write_surfaces(self) -> None:
         if self.reconstruction is not None and self.reconstruction.median_depths:

@@ -47,6 +47,13 @@ class Reconstruction:
 
     def add_keyframe(self, snapshot: MapSnapshot) -> DepthView | None:
         """Meshes, denoises, renders and fuses a keyframe; None where it has too few landmarks."""
+        view = self.depth_view(snapshot)
+        if view is not None:
+            self.fuse(view)
+        return view
+
+    def depth_view(self, snapshot: MapSnapshot) -> DepthView | None:
+        """Meshes, denoises and renders a keyframe; None where it has too few landmarks."""
         with self._timed("meshing"):
             mesh = triangulate(snapshot, self.config.delaunay)
         if mesh is None:
@@ -54,12 +61,14 @@ class Reconstruction:
         with self._timed("denoising"):
             denoised = denoise(mesh, self.config.nltgv)
         with self._timed("rendering"):
-            view = self.renderer.render(snapshot, denoised.mesh, denoised.slopes)
-        self.median_depths.append(float(np.median(1.0 / mesh.inverse_depth)))
+            return self.renderer.render(snapshot, denoised.mesh, denoised.slopes)
+
+    def fuse(self, view: DepthView) -> None:
+        """Integrates a view into both volumes, as soon as the voxels can be chosen."""
+        self.median_depths.append(float(np.median(view.depth[view.depth > 0])) if (view.depth > 0).any() else np.nan)
         self._waiting.append(dataclasses.replace(view, normals_cam=NO_NORMALS))
         if self._voxels_are_known or len(self._waiting) >= self.config.fusion.keyframes_for_depth:
             self._fuse_waiting()
-        return view
 
     def surfaces(self) -> tuple[Surface, Surface]:
         """The coarse and the fine surface of all keyframes so far."""
@@ -73,7 +82,7 @@ class Reconstruction:
     def voxel_lengths(self) -> tuple[float, float]:
         """Sides of the coarse and the fine voxels in map units: as configured, or fractions of the scene's median depth."""
         fusion = self.config.fusion
-        depth = float(np.median(self.median_depths[: fusion.keyframes_for_depth]))
+        depth = float(np.nanmedian(self.median_depths[: fusion.keyframes_for_depth]))
         return fusion.voxel_low or depth / fusion.depth_per_voxel_low, fusion.voxel_high or depth / fusion.depth_per_voxel_high
 
     @property
@@ -90,7 +99,7 @@ class Reconstruction:
     def _fuse(self, view: DepthView) -> None:
         if self.low is None or self.high is None:
             self.low, self.high = (self._volume(length) for length in self.voxel_lengths())
-        max_depth = self.config.fusion.max_depth * float(np.median(self.median_depths))
+        max_depth = self.config.fusion.max_depth * float(np.nanmedian(self.median_depths))
         with self._timed("fusion_low"):
             self.low.integrate(view, self.canvas, max_depth)
         with self._timed("fusion_high"):

@@ -150,6 +150,12 @@ def run_threaded(
     return run.record
 
 
+def run_ahead(source: Iterator[Any]) -> Iterator[Any]:
+    """The items of a generator, computed on a thread of its own a few items ahead; what it raises comes out here."""
+    with _ReadAhead(source) as items:
+        yield from items
+
+
 def _start(indices: range, slam: Slam, sink: SnapshotSink | None, observer: Observer | None, keep_tracks: bool) -> _Run:
     cv2.setNumThreads(1)
     record = RunRecord(num_frames=len(indices), tracks=[] if keep_tracks else None)

@@ -19,12 +19,15 @@ from vitamin3d.mapping.map_initialization import add_view, build_first_map
 from vitamin3d.mapping.p3p_localization import localize
 from vitamin3d.mapping.pose_log import PoseLog
 from vitamin3d.mapping.sparse_map import SparseMap
-from vitamin3d.mapping.subspace_bundle_adjustment import adjust_bundle, adjust_subspace, squared_reprojection_errors
+from vitamin3d.mapping.subspace_bundle_adjustment import adjust_bundle, adjust_schur, adjust_subspace, squared_reprojection_errors
 from vitamin3d.mapping.two_view_initialization import initialize_from_two_views
 from vitamin3d.mapping.window_selection import BundleProblem, Window, build_problem, select_frame_window, select_window, store_solution
 from vitamin3d.tracking.extrema import refine_extrema, select_free_extrema
 from vitamin3d.tracking.extrema_tracking import predict_by_dense_flow, predict_by_dominant_flow, track_extrema
 from vitamin3d.types import Array, Frame, FrontEndFrame, MapSnapshot, SlamState, StepTimes, Tracks, Trajectory
+
+UNTAKEN_WINDOWS = 4
+"""Pictures of keyframes that nobody takes are kept for so many windows."""
 
 
 class Slam:
@@ -186,6 +189,7 @@ class Slam:
     def _add_keyframe(self, front: FrontEndFrame, T_cam_world: Array) -> int:
         keyframe = add_view(self.map, TrackedView(front.frame, *self._seen()), T_cam_world)
         self._pending_frames[keyframe] = front.frame
+        self._pending_frames.pop(keyframe - UNTAKEN_WINDOWS * self.config.window.keyframes, None)
         return keyframe
 
     def _adjust_window(self) -> None:
@@ -194,11 +198,10 @@ class Slam:
             window = select_window(self.map, self.config.window)
             solved, _ = adjust_bundle(build_problem(self.map, window), self.camera, self.config.bundle_adjustment)
             store_solution(self.map, window, solved)
-            self._remove_outliers(window, solved)
+            self._remove_outliers(window, solved, self.config.bundle_adjustment.outlier_px)
 
-    def _remove_outliers(self, window: Window, solved: BundleProblem) -> None:
-        limit = self.config.bundle_adjustment.outlier_px**2
-        is_outlier = squared_reprojection_errors(solved, self.camera) > limit
+    def _remove_outliers(self, window: Window, solved: BundleProblem, limit_px: float) -> None:
+        is_outlier = squared_reprojection_errors(solved, self.camera) > limit_px**2
         is_newest = solved.obs_camera == window.num_adjusted - 1
         self.map.remove_observations(solved.obs_rows[is_outlier])
         ended = solved.landmark_ids[solved.obs_point[is_outlier & is_newest]]
@@ -217,6 +220,19 @@ class Slam:
             solved, _ = adjust_subspace(problem, self.camera, adjustment.sigma_px, adjustment.sweeps_per_frame)
             store_solution(self.map, window, solved)
         return np.asarray(solved.T_cam_world[-1])
+
+    def finish(self) -> None:
+        """The adjustment of the whole map at the end of a recording; the poses of all frames move along."""
+        window_round, final = self.config.bundle_adjustment, self.config.final_adjustment
+        if not final.enabled or not 2 < self.map.num_keyframes <= final.max_keyframes:
+            return
+        everything = Window(np.arange(self.map.num_keyframes), self.map.num_keyframes, 1)
+        with self._timed("final_adjustment"):
+            for sigma, outlier in ((window_round.sigma_px, window_round.outlier_px), (final.sigma_px, final.outlier_px)):
+                problem = build_problem(self.map, everything)
+                solved, _ = adjust_schur(problem, self.camera, sigma, final.iterations, final.relative_gain)
+                store_solution(self.map, everything, solved)
+                self._remove_outliers(everything, solved, outlier)
 
     # --- what leaves ---------------------------------------------------------------------------------------------
 
