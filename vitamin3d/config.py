@@ -40,7 +40,7 @@ class ExtremaConfig:
     min_curvature: float = 0.3
     """Noise floor of kappa, grey levels³ per pixel⁴ of the smoothed 0–255 image."""
     max_tracks: int = 5000
-    refill_interval: int = 3
+    refill_interval: int = 1
     """Frames between two refills with free extrema."""
     min_distance_px: float = 4.0
     """New extrema keep this distance from live tracks and from each other."""
@@ -71,8 +71,11 @@ class ExtremaTrackingConfig:
     prediction_sigma_px: float = 3.0
     """sigma of w in Eq. 5."""
     max_steps: int = 10
-    gate_px: float = 1.5
-    """A climb that ends farther from the prediction is a miss."""
+    gate_px: float = 1.1
+    """A climb that ends farther from the prediction is a miss; and one that ends farther than gate_medians times the
+    frame's median, but not below min_gate_px: where the flow is exact, a far extremum is another one."""
+    gate_medians: float = 2.5
+    min_gate_px: float = 1.0
     coast_frames: int = 1
     """Frames in a row that a track may live on its prediction."""
 
@@ -106,6 +109,10 @@ class LocalizationConfig:
     sigma_px: float = 2.0
     iterations: int = 12
     outlier_px: float = 4.0
+    """A landmark whose track is farther from its projection ends the track; and one farther than outlier_medians times
+    the frame's median error, but not below min_outlier_px: exact pictures deserve a stricter gate than shaky ones."""
+    outlier_medians: float = 4.0
+    min_outlier_px: float = 1.0
     min_inliers: int = 30
     min_inlier_ratio: float = 0.25
 

@@ -92,6 +92,12 @@ def _best_start(T_prior: Array | None, points: Array, pixels: Array, camera: Cam
     return starts[int(np.argmax(scores))] if starts else None
 
 
+def _outlier_limit(errors: Array, config: LocalizationConfig) -> float:
+    """Pixels: a multiple of the median error, within the settings' bounds."""
+    median = float(np.median(errors[errors < config.outlier_px])) if (errors < config.outlier_px).any() else config.outlier_px
+    return min(config.outlier_px, max(config.min_outlier_px, config.outlier_medians * median))
+
+
 def localize(
     points_world: Array, pixels: Array, T_prior: Array | None, camera: Camera, config: LocalizationConfig, seed: int = 0
 ) -> Localization:
@@ -114,7 +120,7 @@ def localize(
         return failed
     T = refine_pose(start, points_world, pixels, camera, config.sigma_px, config.iterations)
     errors = reprojection_errors(T, points_world, pixels, camera.intrinsics)
-    is_inlier = errors < config.outlier_px
+    is_inlier = errors < _outlier_limit(errors, config)
     enough = is_inlier.sum() >= max(config.min_inliers, config.min_inlier_ratio * n)
     rmse = float(np.sqrt((errors[is_inlier] ** 2).mean())) if is_inlier.any() else float("nan")
     return Localization(T, is_inlier, rmse, bool(enough and np.isfinite(T).all()))

@@ -23,7 +23,7 @@ BLOCK_DAMPING = 1e-9
 STEP_HALVINGS = 3
 FIRST_DAMPING = 1e-4
 MAX_DAMPING = 1e8
-POINTS_PER_BLOCK = 1024
+POINTS_PER_BLOCK = 256
 """Points whose part of the reduced camera system is accumulated by one matrix product."""
 
 
