@@ -66,7 +66,7 @@ class Tracker:
 
     def _tracked(self, front: FrontEndFrame) -> Tracks:
         if front.dense_flow is not None:
-            predicted = predict_by_dense_flow(self.tracks.pixels, front.dense_flow)
+            predicted = predict_by_dense_flow(self.tracks.pixels, front.dense_flow, self.config.extrema_tracking.flow_reduction)
         else:
             predicted = predict_by_dominant_flow(self.tracks.pixels, front.dominant_flow)
         return track_extrema(self.tracks, predicted, front.kappa, self.config.extrema_tracking)

@@ -23,7 +23,14 @@ CHOICES = {
     "bundle_adjustment.keyframe_solver": ("schur", "subspace"),
     "fusion.backend": ("scalable", "voxel_block_grid"),
 }
-AT_LEAST_ONE = ("extrema.refill_interval", "dominant_flow.reduction", "initialization.history", "recovery.interval", "window.keyframes")
+AT_LEAST_ONE = (
+    "extrema.refill_interval",
+    "dominant_flow.reduction",
+    "extrema_tracking.flow_reduction",
+    "initialization.history",
+    "recovery.interval",
+    "window.keyframes",
+)
 
 
 @dataclass(frozen=True)
@@ -66,6 +73,8 @@ class ExtremaTrackingConfig:
 
     prediction: str = "dense_flow"
     """`dominant_flow` (Eq. 4, the paper) or `dense_flow` (DIS flow, several times more survivors)."""
+    flow_reduction: int = 2
+    """The dense flow is computed on the picture reduced by this."""
     prediction_weight: float = 0.3
     """lambda of Eq. 5, relative to the noise floor's unit of kappa."""
     prediction_sigma_px: float = 3.0

@@ -69,7 +69,7 @@ class Slam:
     def _track(self, front: FrontEndFrame) -> Tracks:
         """Predict (Eq. 4) and climb (Eq. 5)."""
         if front.dense_flow is not None:
-            predicted = predict_by_dense_flow(self.tracks.pixels, front.dense_flow)
+            predicted = predict_by_dense_flow(self.tracks.pixels, front.dense_flow, self.config.extrema_tracking.flow_reduction)
         else:
             predicted = predict_by_dominant_flow(self.tracks.pixels, front.dominant_flow)
         return track_extrema(self.tracks, predicted, front.kappa, self.config.extrema_tracking)

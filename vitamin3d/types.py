@@ -57,7 +57,7 @@ class FrontEndFrame:
     """(E, 2) int32, (u, v) of all local maxima of kappa above the noise floor, strongest first."""
     dominant_flow: DominantFlow
     dense_flow: Array | None
-    """(H, W, 2) float32 from the previous to this frame, or None where the prediction does not use it."""
+    """(h, w, 2) float32 from the previous to this frame, of and in pixels of the reduced picture; None where it is not used."""
 
 
 @dataclass(frozen=True)

@@ -75,6 +75,24 @@ def test_flow_samples_equal_their_twin(rng):
     assert predict_by_dense_flow(pixels[:0], flow).shape == (0, 2)
 
 
+def test_a_reduced_flow_is_sampled_on_the_pixel_centres_of_the_picture():
+    u, v = np.meshgrid(np.arange(12.0), np.arange(10.0))
+    flow = np.stack([0.1 * u, 0.05 * v], axis=2).astype(np.float32)  # in reduced pixels; full ones: (x + 0.5) / 3 - 0.5
+    pixels = np.array([[10.0, 7.0], [16.0, 22.0]])
+    reduced = (pixels + 0.5) / 3 - 0.5
+    np.testing.assert_allclose(predict_by_dense_flow(pixels, flow, 3), pixels + 3 * reduced * [0.1, 0.05], atol=1e-5)
+
+
+def test_a_far_extremum_is_a_miss_where_the_others_are_near():
+    kappa = np.zeros((40, 200), np.float32)
+    kappa[20, 10:190:10] = 5.0
+    seen = np.array([[u + 0.1, 20.0] for u in range(10, 190, 10)])
+    seen[3, 0] += 1.0
+    tracks = tracks_at(seen)
+    moved = track_extrema(tracks, tracks.pixels, kappa, dataclasses.replace(CONFIG, gate_px=1.5, gate_medians=2.5, min_gate_px=0.5))
+    assert moved.missed[3] == 1 and np.delete(moved.missed, 3).max() == 0
+
+
 def test_dominant_flow_prediction_is_equation_4():
     flow = DominantFlow(np.array([[1.0, 0.5], [0.0, 2.0]]), np.array([10.0, -1.0]), 1.0)
     np.testing.assert_allclose(predict_by_dominant_flow(np.array([[2.0, 4.0]]), flow), [[14.0, 7.0]])

@@ -8,6 +8,9 @@ from vitamin3d._jit import kernel
 from vitamin3d.config import CurvatureConfig
 from vitamin3d.types import Array
 
+TAPS_PER_SIGMA = 3.0
+"""Half the width of the Gaussian filter."""
+
 
 @kernel
 def _curvature(f, kappa):  # type: ignore[no-untyped-def]
@@ -31,8 +34,10 @@ def _curvature(f, kappa):  # type: ignore[no-untyped-def]
 def smoothed(image: Array, config: CurvatureConfig) -> Array:
     """The picture (H, W) uint8 as float32 grey levels 0–255 after a Gaussian blur."""
     sigma = config.smoothing_sigma_px
-    floating = np.asarray(image, np.float32)
-    return np.asarray(cv2.GaussianBlur(floating, (0, 0), sigma, borderType=cv2.BORDER_REPLICATE)) if sigma > 0 else floating
+    if sigma <= 0:
+        return np.asarray(image, np.float32)
+    taps = cv2.getGaussianKernel(2 * round(TAPS_PER_SIGMA * sigma) + 1, sigma, cv2.CV_32F)
+    return np.asarray(cv2.sepFilter2D(image, cv2.CV_32F, taps, taps, borderType=cv2.BORDER_REPLICATE))
 
 
 def curvature(image: Array, config: CurvatureConfig) -> Array:

@@ -1,6 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """Local maxima of the curvature: the features of the method (Sec. 2.1)."""
 
+import cv2
 import numpy as np
 
 from vitamin3d._jit import inlined, kernel
@@ -8,25 +9,29 @@ from vitamin3d.config import ExtremaConfig
 from vitamin3d.types import Array
 
 CELL_PX = 32
+NEIGHBOURS = np.ones((3, 3), np.uint8)
 
 
 @kernel
-def _local_maxima(kappa, floor, border, out):  # type: ignore[no-untyped-def]
-    """Pixels above `floor` that exceed their four earlier neighbours and are not below their four later ones."""
+def _local_maxima(kappa, candidates, floor, border, out):  # type: ignore[no-untyped-def]
+    """Of the flat pixel indices `candidates`, those above `floor`, above their four earlier and not below their four
+    later neighbours; (u, v) into out, their number is returned."""
     height, width = kappa.shape
     count = 0
-    for v in range(border, height - border):
-        for u in range(border, width - border):
-            k = kappa[v, u]
-            if not k > floor or k <= kappa[v, u - 1] or k < kappa[v, u + 1]:
-                continue
-            if k <= kappa[v - 1, u - 1] or k <= kappa[v - 1, u] or k <= kappa[v - 1, u + 1]:
-                continue
-            if k < kappa[v + 1, u - 1] or k < kappa[v + 1, u] or k < kappa[v + 1, u + 1]:
-                continue
-            out[count, 0] = u
-            out[count, 1] = v
-            count += 1
+    for i in candidates:
+        v, u = i // width, i % width
+        if v < border or u < border or v >= height - border or u >= width - border:
+            continue
+        k = kappa[v, u]
+        if not k > floor or k <= kappa[v, u - 1] or k < kappa[v, u + 1]:
+            continue
+        if k <= kappa[v - 1, u - 1] or k <= kappa[v - 1, u] or k <= kappa[v - 1, u + 1]:
+            continue
+        if k < kappa[v + 1, u - 1] or k < kappa[v + 1, u] or k < kappa[v + 1, u + 1]:
+            continue
+        out[count, 0] = u
+        out[count, 1] = v
+        count += 1
     return count
 
 
@@ -68,8 +73,10 @@ def _occupy(pixels, radius, occupied):  # type: ignore[no-untyped-def]
 
 def detect_extrema(kappa: Array, config: ExtremaConfig) -> Array:
     """All local maxima (E, 2) int32 `u v` of kappa (H, W) above the noise floor, strongest first."""
-    buffer = np.empty((kappa.size // 2 + 1, 2), np.int32)
-    extrema = buffer[: _local_maxima(kappa, np.float32(config.min_curvature), max(1, config.border_px), buffer)]
+    candidates = np.flatnonzero(kappa >= cv2.dilate(kappa, NEIGHBOURS))  # the many that are none leave at SIMD speed
+    buffer = np.empty((len(candidates), 2), np.int32)
+    floor, border = np.float32(config.min_curvature), max(1, config.border_px)
+    extrema = buffer[: _local_maxima(kappa, candidates, floor, border, buffer)]
     return extrema[np.argsort(-kappa[extrema[:, 1], extrema[:, 0]], kind="stable")]
 
 

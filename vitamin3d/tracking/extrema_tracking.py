@@ -49,18 +49,18 @@ def _climb_all(kappa, predicted, weight, sigma, max_steps, gate, out, out_kappa,
 
 
 @kernel
-def _sample_flow(flow, pixels, out):  # type: ignore[no-untyped-def]
-    """pixels + bilinear sample of flow (H, W, 2), clamped to the image."""
+def _sample_flow(flow, reduction, pixels, out):  # type: ignore[no-untyped-def]
+    """pixels + bilinear sample of flow (h, w, 2), both in its own pixels, `reduction` of the image's each; clamped."""
     height, width = flow.shape[:2]
     for i in range(pixels.shape[0]):
-        x = min(max(pixels[i, 0], 0.0), width - 1.001)
-        y = min(max(pixels[i, 1], 0.0), height - 1.001)
+        x = min(max((pixels[i, 0] + 0.5) / reduction - 0.5, 0.0), width - 1.001)
+        y = min(max((pixels[i, 1] + 0.5) / reduction - 0.5, 0.0), height - 1.001)
         u, v = int(x), int(y)
         a, b = x - u, y - v
         for c in range(2):
             top = (1.0 - a) * flow[v, u, c] + a * flow[v, u + 1, c]
             bottom = (1.0 - a) * flow[v + 1, u, c] + a * flow[v + 1, u + 1, c]
-            out[i, c] = pixels[i, c] + (1.0 - b) * top + b * bottom
+            out[i, c] = pixels[i, c] + reduction * ((1.0 - b) * top + b * bottom)
 
 
 def predict_by_dominant_flow(pixels: Array, flow: DominantFlow) -> Array:
@@ -68,10 +68,10 @@ def predict_by_dominant_flow(pixels: Array, flow: DominantFlow) -> Array:
     return np.asarray(pixels @ flow.A.T + flow.b)
 
 
-def predict_by_dense_flow(pixels: Array, flow: Array) -> Array:
-    """Predictions (N, 2) of pixels (N, 2) by a flow field (H, W, 2)."""
+def predict_by_dense_flow(pixels: Array, flow: Array, reduction: int = 1) -> Array:
+    """Predictions (N, 2) of pixels (N, 2) by a flow field (H / reduction, W / reduction, 2) in its own pixels."""
     out = np.empty((len(pixels), 2))
-    _sample_flow(flow, np.ascontiguousarray(pixels, np.float64), out)
+    _sample_flow(flow, float(reduction), np.ascontiguousarray(pixels, np.float64), out)
     return out
 
 

@@ -12,17 +12,21 @@ from vitamin3d.tracking.dominant_flow import CoarseFeatures, coarse_features, es
 from vitamin3d.tracking.extrema import detect_extrema
 from vitamin3d.types import Array, DominantFlow, Frame, FrontEndFrame, StepTimes
 
+FINEST_OCTAVE, DESCENT_ITERATIONS = 2, 8
+"""DIS stops at a quarter of the picture's size, whatever it is given."""
 IDENTITY_FLOW = DominantFlow(np.eye(2), np.zeros(2), 0.0)
 
 
 class FrontEnd:
-    """Turns consecutive frames into curvature, extrema and flow; remembers the previous picture."""
+    """Turns consecutive frames into curvature, extrema and flow; remembers the previous picture, reduced."""
 
     def __init__(self, config: Config) -> None:
         self.config = config
         self.times = StepTimes()
         self._dis = cv2.DISOpticalFlow_create(cv2.DISOPTICAL_FLOW_PRESET_ULTRAFAST)  # type: ignore[attr-defined]
-        self._previous: Array | None = None
+        self._dis.setFinestScale(max(0, FINEST_OCTAVE - round(float(np.log2(config.extrema_tracking.flow_reduction)))))
+        self._dis.setGradientDescentIterations(DESCENT_ITERATIONS)
+        self._reduced: Array | None = None
         self._features: CoarseFeatures | None = None
         self._dominant_flow = IDENTITY_FLOW
 
@@ -33,18 +37,21 @@ class FrontEnd:
         extrema = detect_extrema(kappa, self.config.extrema)
         after_extrema = time.perf_counter()
         flow = self._dense_flow(frame.image)
-        if flow is None:
+        if self.config.extrema_tracking.prediction == "dominant_flow":
             self._update_dominant_flow(frame.image)
-        self._previous = frame.image
         self.times.add("curvature_extrema", after_extrema - start)
         self.times.add("flow", time.perf_counter() - after_extrema)
         return FrontEndFrame(frame, kappa, extrema, self._dominant_flow, flow)
 
     def _dense_flow(self, image: Array) -> Array | None:
-        """DIS flow (H, W, 2) from the previous picture, where the settings ask for it and there is one to match."""
-        if self.config.extrema_tracking.prediction != "dense_flow" or self._previous is None:
+        """DIS flow (h, w, 2) from the previous picture, reduced, where the settings ask for it and there is one to match."""
+        if self.config.extrema_tracking.prediction != "dense_flow":
             return None
-        return np.asarray(self._dis.calc(self._previous, image, None))
+        reduction = self.config.extrema_tracking.flow_reduction
+        height, width = (n // reduction for n in image.shape)
+        whole = image[: height * reduction, : width * reduction]  # so that the reduction is exact
+        previous, self._reduced = self._reduced, cv2.resize(whole, (width, height), interpolation=cv2.INTER_AREA)
+        return None if previous is None else np.asarray(self._dis.calc(previous, self._reduced, None))
 
     def _update_dominant_flow(self, image: Array) -> None:
         features = coarse_features(image, self.config.dominant_flow)
