@@ -124,6 +124,11 @@ class LocalizationConfig:
     min_outlier_px: float = 1.0
     min_inliers: int = 30
     min_inlier_ratio: float = 0.25
+    min_kept_ratio: float = 0.1
+    """Inliers over all tracks of landmarks, those that coast included; below it the picture has jumped."""
+    min_median_zncc: float = 0.4
+    """Of the landmarks' patches. Extrema are everywhere: after a jump of the picture tracks climb to others nearby and
+    agree on a camera that stands still; only the looks of the place tell."""
 
 
 @dataclass(frozen=True)
@@ -159,6 +164,23 @@ class RecoveryConfig:
     min_zncc: float = 0.8
     patch_px: int = 9
     min_observations: int = 3
+
+
+@dataclass(frozen=True)
+class RelocalizationConfig:
+    """The camera found again by descriptors, when its tracks broke."""
+
+    enabled: bool = True
+    keyframes: int = 6
+    """The newest that are tried."""
+    corners: int = 2000
+    max_distance_px: float = 3.0
+    """Between a keyframe's corner and the landmark that it lends."""
+    min_inliers: int = 25
+    min_inlier_ratio: float = 0.1
+    ransac_iterations: int = 500
+    gate_px: float = 6.0
+    """Of the first search for the landmarks around their projections."""
 
 
 @dataclass(frozen=True)
@@ -300,6 +322,7 @@ class Config:
     keyframes: KeyframeConfig = field(default_factory=KeyframeConfig)
     triangulation: TriangulationConfig = field(default_factory=TriangulationConfig)
     recovery: RecoveryConfig = field(default_factory=RecoveryConfig)
+    relocalization: RelocalizationConfig = field(default_factory=RelocalizationConfig)
     window: WindowConfig = field(default_factory=WindowConfig)
     bundle_adjustment: BundleAdjustmentConfig = field(default_factory=BundleAdjustmentConfig)
     final_adjustment: FinalAdjustmentConfig = field(default_factory=FinalAdjustmentConfig)
@@ -317,9 +340,10 @@ def paper_config() -> Config:
     return Config(
         mode="paper",
         curvature=CurvatureConfig(smoothing_sigma_px=2.5),
-        extrema_tracking=ExtremaTrackingConfig(prediction="dominant_flow", gate_px=8.0, coast_frames=0),
-        localization=LocalizationConfig(prior_inlier_ratio=2.0),
+        extrema_tracking=ExtremaTrackingConfig(prediction="dominant_flow", gate_px=8.0, gate_medians=100.0, coast_frames=0),
+        localization=LocalizationConfig(prior_inlier_ratio=2.0, outlier_medians=100.0),
         recovery=RecoveryConfig(enabled=False),
+        relocalization=RelocalizationConfig(enabled=False),
         window=WindowConfig(anchors=0),
         final_adjustment=FinalAdjustmentConfig(enabled=False),
         bundle_adjustment=BundleAdjustmentConfig(keyframe_solver="subspace", keyframe_iterations=20),

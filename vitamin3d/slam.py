@@ -4,6 +4,7 @@
 import time
 from collections.abc import Iterator
 from contextlib import contextmanager
+from dataclasses import replace
 
 import numpy as np
 
@@ -12,12 +13,13 @@ from vitamin3d.geometry.camera import Camera
 from vitamin3d.geometry.se3 import inverse
 from vitamin3d.mapping.initialization_history import InitializationHistory, TrackedView
 from vitamin3d.mapping.keyframe_selection import is_keyframe
-from vitamin3d.mapping.landmark_recovery import recover_landmarks
+from vitamin3d.mapping.landmark_recovery import cut_patches, patch_similarity, recover_landmarks
 from vitamin3d.mapping.landmark_statistics import keyframe_vertices
 from vitamin3d.mapping.landmark_triangulation import triangulate_landmarks
 from vitamin3d.mapping.map_initialization import add_view, build_first_map
 from vitamin3d.mapping.p3p_localization import localize
 from vitamin3d.mapping.pose_log import PoseLog
+from vitamin3d.mapping.relocalization import relocalize
 from vitamin3d.mapping.sparse_map import SparseMap
 from vitamin3d.mapping.subspace_bundle_adjustment import adjust_bundle, adjust_schur, adjust_subspace, squared_reprojection_errors
 from vitamin3d.mapping.two_view_initialization import initialize_from_two_views
@@ -26,6 +28,8 @@ from vitamin3d.tracking.extrema import refine_extrema, select_free_extrema
 from vitamin3d.tracking.extrema_tracking import predict_by_dense_flow, predict_by_dominant_flow, track_extrema
 from vitamin3d.types import Array, Frame, FrontEndFrame, MapSnapshot, SlamState, StepTimes, Tracks, Trajectory
 
+PATCH_STRIDE = 8
+"""Of the tracks whose looks are checked in each frame."""
 UNTAKEN_WINDOWS = 4
 """Pictures of keyframes that nobody takes are kept for so many windows."""
 
@@ -135,9 +139,10 @@ class Slam:
         prior = self.poses.predict(self.map)
         found = localize(self.map.points_world[ids], pixels[mapped], prior, self.camera, self.config.localization, seed)
         if not found.converged:
-            self.state = SlamState.LOST
-            self._recover(front, prior)
-            return None
+            return self._find_camera(front)
+        if self._has_jumped(front.frame, seen.select(mapped).select(found.is_inlier)):
+            self.tracks = Tracks.empty()
+            return self._find_camera(front)
         self.state = SlamState.TRACKING
         self.tracks = self.tracks.select(~np.isin(self.tracks.ids, ids[~found.is_inlier]))
         recovery = self.config.recovery
@@ -145,10 +150,45 @@ class Slam:
             return self._relocalize(found.T_cam_world)
         return found.T_cam_world
 
-    def _recover(self, front: FrontEndFrame, T_cam_world: Array) -> int:
+    def _has_jumped(self, frame: Frame, inliers: Tracks) -> bool:
+        """Whether few tracks of landmarks are left, or the places where they ended look unlike their last keyframes."""
+        localization = self.config.localization
+        if len(inliers) < localization.min_kept_ratio * self.map.is_mapped(self.tracks.ids).sum():
+            return True
+        sample = inliers.select(slice(None, None, PATCH_STRIDE))
+        similarity = patch_similarity(self.map.patches[sample.ids], cut_patches(frame.image, sample.pixels))
+        return bool(np.median(similarity) < localization.min_median_zncc)
+
+    def _find_camera(self, front: FrontEndFrame) -> Array | None:
+        """T_cam_world of a frame whose tracks broke: descriptors, then a search for the landmarks themselves; or LOST."""
+        self.state, settings = SlamState.LOST, self.config.relocalization
+        if not settings.enabled:
+            return None
+        keyframes = sorted(self._pending_frames.items())[-settings.keyframes :]
+        strictness = replace(
+            self.config.localization,
+            min_inliers=settings.min_inliers,
+            min_inlier_ratio=settings.min_inlier_ratio,
+            ransac_iterations=settings.ransac_iterations,
+        )
+        found = relocalize(front.frame, keyframes, self.map, self.camera, settings, strictness)
+        if not found.converged:
+            return None
+        self.tracks = Tracks.empty()
+        self._recover(front, found.T_cam_world, settings.gate_px)
+        T_cam_world = self._relocalize(found.T_cam_world)
+        self._recover(front, T_cam_world)
+        seen, _ = self._seen()
+        if self.map.is_mapped(seen.ids).sum() < self.config.localization.min_inliers:
+            return None
+        self.state = SlamState.TRACKING
+        return self._relocalize(T_cam_world)
+
+    def _recover(self, front: FrontEndFrame, T_cam_world: Array, gate_px: float | None = None) -> int:
         """Takes up landmarks that came back into view; how many."""
         before = self.tracks.ids
         image, recovery = front.frame.image, self.config.recovery
+        recovery = recovery if gate_px is None else replace(recovery, gate_px=gate_px)
         self.tracks = recover_landmarks(self.tracks, self.map, image, front.kappa, T_cam_world, self.camera, recovery)
         return int((~np.isin(self.tracks.ids, before)).sum())
 

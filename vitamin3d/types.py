@@ -78,8 +78,8 @@ class Tracks:
     def __len__(self) -> int:
         return len(self.ids)
 
-    def select(self, keep: Array) -> "Tracks":
-        """The tracks of a mask (N,) bool or of indices."""
+    def select(self, keep: Array | slice) -> "Tracks":
+        """The tracks of a mask (N,) bool, of indices, or of a slice."""
         return Tracks(self.ids[keep], self.pixels[keep], self.kappa[keep], self.ages[keep], self.missed[keep])
 
     @staticmethod
