@@ -80,7 +80,7 @@ class ExtremaTrackingConfig:
     prediction_sigma_px: float = 3.0
     """sigma of w in Eq. 5."""
     max_steps: int = 10
-    gate_px: float = 1.1
+    gate_px: float = 1.5
     """A climb that ends farther from the prediction is a miss; and one that ends farther than gate_medians times the
     frame's median, but not below min_gate_px: where the flow is exact, a far extremum is another one."""
     gate_medians: float = 2.5
