@@ -8,7 +8,7 @@ and reconstructs behind it, joined by bounded queues of immutable messages. Both
 import contextlib
 import queue
 import threading
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterable, Iterator
 from dataclasses import dataclass, field
 from typing import Any, Protocol
 
@@ -75,6 +75,16 @@ class _Run:
     def __init__(self, slam: Slam, record: RunRecord, observer: Observer, sink: SnapshotSink | None) -> None:
         self.slam, self.record, self.observer, self.sink = slam, record, observer, sink
 
+    def all_frames(self, fronts: Iterable[FrontEndFrame | Unreadable]) -> RunRecord:
+        """Frame by frame until the end, or until the observer stops it; then the last keyframes are handed over."""
+        for front in fronts:
+            if self.observer.should_stop():
+                self.record.interrupted = True
+                break
+            self.frame(front)
+        self.hand_over(everything=True)
+        return self.record
+
     def frame(self, front: FrontEndFrame | Unreadable) -> None:
         if isinstance(front, Unreadable):
             self.record.skipped.append(front)
@@ -116,13 +126,7 @@ def run_sequential(
         keep_tracks: the record keeps the tracks of each frame.
     """
     run = _start(indices, slam, sink, observer, keep_tracks)
-    for front in _front_frames(dataset, indices, front_end):
-        if run.observer.should_stop():
-            run.record.interrupted = True
-            break
-        run.frame(front)
-    run.hand_over(everything=True)
-    return run.record
+    return run.all_frames(_front_frames(dataset, indices, front_end))
 
 
 def run_threaded(
@@ -141,13 +145,7 @@ def run_threaded(
     """
     with _Worker(SNAPSHOTS_AHEAD, sink) as dense, _ReadAhead(_front_frames(dataset, indices, front_end)) as fronts:
         run = _start(indices, slam, dense.put if sink else None, observer, keep_tracks)
-        for front in fronts:
-            if run.observer.should_stop():
-                run.record.interrupted = True
-                break
-            run.frame(front)
-        run.hand_over(everything=True)
-    return run.record
+        return run.all_frames(fronts)
 
 
 def run_ahead(source: Iterator[Any]) -> Iterator[Any]:

@@ -123,7 +123,7 @@ class Slam:
         for view in self._history.views:
             k = keyframe_of_frame.get(view.frame.index)
             if k is not None:
-                self.poses.add(view.frame, k, np.eye(4), self.map)
+                self.poses.add(view.frame, k, np.eye(4))
                 continue
             mapped = self.map.is_mapped(view.tracks.ids)
             points = self.map.points_world[view.tracks.ids[mapped]]
@@ -211,7 +211,7 @@ class Slam:
             keyframe = self._add_keyframe(front, T_cam_world)
             triangulate_landmarks(self.map, self.camera, self.config.triangulation)
             self._adjust_window()
-            self.poses.add(front.frame, keyframe, np.eye(4), self.map)
+            self.poses.add(front.frame, keyframe, np.eye(4))
         else:
             T_cam_world = self._adjust_with_frame(T_cam_world)
             self.poses.add_world(front.frame, T_cam_world, self.map)

@@ -158,7 +158,7 @@ def logged(scene):
     """Keyframes 0, 10, 20 ... and, between them, frames 11 and 12."""
     sparse_map, log = map_of(scene), PoseLog()
     for k in range(8):
-        log.add(Frame(10 * k, 10**9 * k, NO_PICTURE), k, np.eye(4), sparse_map)
+        log.add(Frame(10 * k, 10**9 * k, NO_PICTURE), k, np.eye(4))
     between = exp_se3(np.array([0.1, 0, 0, 0, 0.02, 0])) @ scene.T_cam_world[1]
     log.add_world(Frame(11, 11 * 10**8, NO_PICTURE), between, sparse_map)
     return sparse_map, log, between

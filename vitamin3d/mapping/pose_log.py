@@ -18,7 +18,7 @@ class PoseLog:
     def __len__(self) -> int:
         return len(self._entries)
 
-    def add(self, frame: Frame, keyframe: int, T_cam_keyframe: Array, sparse_map: SparseMap) -> None:
+    def add(self, frame: Frame, keyframe: int, T_cam_keyframe: Array) -> None:
         """Logs a frame by its pose relative to a keyframe (the identity for the keyframe itself)."""
         self._entries[frame.index] = (frame.timestamp_ns, keyframe, T_cam_keyframe)
         self._last = [*self._last[-1:], frame.index]
@@ -26,7 +26,7 @@ class PoseLog:
     def add_world(self, frame: Frame, T_cam_world: Array, sparse_map: SparseMap) -> None:
         """Logs a frame by its pose (4, 4), relative to the newest keyframe that is not younger."""
         keyframe = max(0, int(np.searchsorted(sparse_map.frame_indices, frame.index, side="right")) - 1)
-        self.add(frame, keyframe, T_cam_world @ inverse(sparse_map.T_cam_world[keyframe]), sparse_map)
+        self.add(frame, keyframe, T_cam_world @ inverse(sparse_map.T_cam_world[keyframe]))
 
     def pose(self, frame_index: int, sparse_map: SparseMap) -> Array:
         """T_cam_world (4, 4) of a logged frame as the map stands now."""
