@@ -1,31 +1,15 @@
 # SPDX-License-Identifier: Apache-2.0
 """The command line, thin: options in, one job, exit codes out. Heavy imports wait until a command runs."""
 
-import os
 import sys
-from enum import Enum
-from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from vitamin3d.errors import InputError, Vitamin3dError
-
-if TYPE_CHECKING:
-    from vitamin3d.config import Config
-    from vitamin3d.job import Job, Outcome
-
-EXIT_ERROR, EXIT_NO_MAP, EXIT_INTERRUPTED = 2, 3, 130
-ONE_THREAD_EACH = ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS")
+from vitamin3d.commands.process import EXIT_ERROR
+from vitamin3d.commands.reconstruct import reconstruct, show_config
+from vitamin3d.errors import Vitamin3dError
 
 app = typer.Typer(add_completion=False, no_args_is_help=True, pretty_exceptions_enable=False, rich_markup_mode=None)
-
-
-class Mode(str, Enum):
-    """Named settings."""
-
-    default = "default"
-    paper = "paper"
 
 
 @app.callback()
@@ -33,54 +17,8 @@ def _vitamin3d() -> None:
     """From the pictures of one calibrated camera to a trajectory, a dense cloud and a mesh, on a CPU."""
 
 
-@app.command()
-def reconstruct(
-    source: Annotated[Path, typer.Argument(help="EuRoC, TUM or KITTI folder, folder of pictures, or video.")],
-    out: Annotated[Path, typer.Option("--out", "-o", help="Folder for the results.")],
-    calibration: Annotated[Path | None, typer.Option(help="Camera file with the fields of EuRoC's sensor.yaml.")] = None,
-    mode: Annotated[Mode, typer.Option(help="default: what measures best; paper: the literal paper.")] = Mode.default,
-    config: Annotated[Path | None, typer.Option(help="TOML file with settings that differ from the mode's.")] = None,
-    threads: Annotated[bool, typer.Option("--threads/--sequential", help="Overlap the steps, or one after the other.")] = True,
-    seed: Annotated[int | None, typer.Option(min=0, help="Of the random samples.")] = None,
-    start: Annotated[int, typer.Option(min=0, help="First frame.")] = 0,
-    max_frames: Annotated[int | None, typer.Option(min=2, help="At most so many frames.")] = None,
-    stride: Annotated[int, typer.Option(min=1, help="Every so many-th frame.")] = 1,
-    voxel_low: Annotated[float | None, typer.Option(help="Coarse voxels, metres; needs a scale.")] = None,
-    voxel_high: Annotated[float | None, typer.Option(help="Fine voxels, metres; needs a scale.")] = None,
-    metric_scale: Annotated[float | None, typer.Option(help="Metres per map unit.")] = None,
-    scale_from_ground_truth: Annotated[bool, typer.Option("--scale-from-ground-truth", help="Take the scale from it.")] = False,
-    live: Annotated[bool, typer.Option("--live", help="Fuse while tracking, without the final adjustment of the map before.")] = False,
-    save_tracks: Annotated[bool, typer.Option("--save-tracks", help="Also write tracks.npz.")] = False,
-    overwrite: Annotated[bool, typer.Option("--overwrite", help="Replace an earlier result.")] = False,
-    quiet: Annotated[bool, typer.Option("--quiet", "-q", help="Warnings and the result only.")] = False,
-) -> None:
-    """Reconstruct a sequence: trajectory, cloud, meshes, depth and normal maps."""
-    _one_thread_each()
-    from vitamin3d.job import Job, Selection
-
-    job = Job(
-        _settings(mode, config, seed, _voxels(voxel_low, voxel_high, metric_scale, scale_from_ground_truth)),
-        Selection(start, max_frames, stride),
-        threads,
-        metric_scale,
-        scale_from_ground_truth,
-        save_tracks,
-        live,
-    )
-    try:
-        code = _run(source, calibration, job, out, overwrite, quiet)
-    except KeyboardInterrupt:  # caught here: Typer would end without a word
-        typer.echo("vitamin3d: interrupted, nothing saved", err=True)
-        code = EXIT_INTERRUPTED
-    raise typer.Exit(code)
-
-
-@app.command("config")
-def show_config(mode: Annotated[Mode, typer.Option(help="Which named settings.")] = Mode.default) -> None:
-    """Print all settings as TOML, for --config."""
-    from vitamin3d.config import dump_toml
-
-    typer.echo(dump_toml(_named(mode)), nl=False)
+app.command()(reconstruct)
+app.command("config")(show_config)
 
 
 @app.command()
@@ -89,75 +27,6 @@ def version() -> None:
     from importlib.metadata import version as installed
 
     typer.echo(installed("vitamin3d"))
-
-
-def _one_thread_each() -> None:
-    """OpenMP spins when threads outnumber cores: our threads do the overlapping. Before the libraries load."""
-    for name in ONE_THREAD_EACH:
-        os.environ.setdefault(name, "1")
-    os.environ.setdefault("OMP_WAIT_POLICY", "passive")
-
-
-def _named(mode: Mode) -> "Config":
-    from vitamin3d.config import Config, paper_config
-
-    return paper_config() if mode is Mode.paper else Config()
-
-
-def _voxels(low: float | None, high: float | None, metric_scale: float | None, from_truth: bool) -> dict[str, Any]:
-    """The given voxel sizes in metres; InputError where they or the scale make no sense."""
-    given = {name: value for name, value in (("voxel_low", low), ("voxel_high", high)) if value is not None}
-    if metric_scale is not None and from_truth:
-        raise InputError("--metric-scale and --scale-from-ground-truth exclude each other; give one")
-    if given and metric_scale is None and not from_truth:
-        raise InputError("--voxel-low and --voxel-high are in metres and need --metric-scale or --scale-from-ground-truth")
-    for name, value in {**given, "metric_scale": metric_scale}.items():
-        if value is not None and not 0.0 < value < float("inf"):
-            raise InputError(f"--{name.replace('_', '-')}: must be positive, not {value}")
-    return given
-
-
-def _settings(mode: Mode, path: Path | None, seed: int | None, voxels: dict[str, Any]) -> "Config":
-    import dataclasses
-
-    from vitamin3d.config import load_toml
-
-    config = _named(mode) if path is None else load_toml(path, _named(mode))
-    config = config if seed is None else dataclasses.replace(config, seed=seed)
-    return dataclasses.replace(config, fusion=dataclasses.replace(config.fusion, **voxels))
-
-
-def _run(source: Path, calibration: Path | None, job: "Job", out: Path, overwrite: bool, quiet: bool) -> int:
-    """Opens, reconstructs, prints what came out; the exit code."""
-    from vitamin3d._jit import kernels_are_cached
-    from vitamin3d.datasets import open_dataset
-    from vitamin3d.exporters.output_folder import OutputFolder
-    from vitamin3d.job import reconstruct_sequence
-    from vitamin3d.progress import ConsoleObserver
-
-    dataset = open_dataset(source, calibration)
-    job.selection.indices(len(dataset))
-    output = OutputFolder(out, overwrite)
-    with ConsoleObserver(quiet) as observer:
-        if not kernels_are_cached():
-            observer.line("first run: the numerical kernels are being compiled, once; this takes about a minute")
-        outcome = reconstruct_sequence(dataset, job, output, observer)
-    return _conclude(outcome, out)
-
-
-def _conclude(outcome: "Outcome", out: Path) -> int:
-    stats = outcome.stats
-    if not outcome.has_map:
-        typer.echo(f"no map: {outcome.slam.initialization_reason} ({stats['processed_frames']} frames; see {out / 'stats.json'})", err=True)
-        return EXIT_INTERRUPTED if outcome.record.interrupted else EXIT_NO_MAP
-    typer.echo(
-        f"{stats['tracked_frames']} of {stats['frames']} frames localised, {stats['keyframes']} keyframes, "
-        f"{stats['cloud_points']} points, {stats['wall_seconds']:.0f} s; {outcome.scale.remark}"
-    )
-    for name in ("mesh_high.ply", "mesh_high.obj", "mesh_low.ply", "cloud.ply", "trajectory.tum"):
-        if (out / name).exists():
-            typer.echo(f"  {out / name}")
-    return EXIT_INTERRUPTED if outcome.record.interrupted else 0
 
 
 def main() -> None:

@@ -16,8 +16,8 @@ import numpy as np
 import pytest
 from scenes import DEMO
 
-from vitamin3d import cli
 from vitamin3d.cli import main
+from vitamin3d.commands.process import ONE_THREAD_EACH
 from vitamin3d.progress import ConsoleObserver
 
 PICTURES = sorted((DEMO / "mav0" / "cam0" / "data").glob("*.jpg"))
@@ -37,7 +37,7 @@ class Result:
 @pytest.fixture
 def vitamin3d(monkeypatch, capsys):
     """Runs the console script in this process."""
-    for name in (*cli.ONE_THREAD_EACH, "OMP_WAIT_POLICY"):
+    for name in (*ONE_THREAD_EACH, "OMP_WAIT_POLICY"):
         monkeypatch.setenv(name, os.environ.get(name, "1" if name != "OMP_WAIT_POLICY" else "passive"))
 
     def run(*arguments):
