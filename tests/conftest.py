@@ -1,6 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
 """What all tests share; its presence also puts this folder on the path (`reference`, `reference_dense`, `scenes`)."""
 
+import os
+import sys
 from pathlib import Path
 
 import cv2
@@ -46,3 +48,37 @@ def demo():
     from vitamin3d.datasets import open_dataset
 
     return open_dataset(scenes.DEMO)
+
+
+class Told:
+    """What a command said and how it ended."""
+
+    def __init__(self, code, out, err):
+        self.code, self.out, self.err = code, out, err
+
+    @property
+    def error(self):
+        """The one line of a refusal."""
+        (line,) = self.err.splitlines()
+        assert self.code == 2 and line.startswith("vitamin3d: ") and self.out == "", (self.code, self.err)
+        return line
+
+
+@pytest.fixture
+def command(monkeypatch, capsys):
+    """Runs the console script in this process."""
+    from vitamin3d.cli import main
+    from vitamin3d.commands.process import ONE_THREAD_EACH
+
+    for name in (*ONE_THREAD_EACH, "OMP_WAIT_POLICY"):
+        monkeypatch.setenv(name, os.environ.get(name, "1" if name != "OMP_WAIT_POLICY" else "passive"))
+
+    def run(*arguments):
+        monkeypatch.setattr(sys, "argv", ["vitamin3d", *map(str, arguments)])
+        with pytest.raises(SystemExit) as caught:
+            main()
+        out, err = capsys.readouterr()
+        assert "Traceback" not in out + err
+        return Told(caught.value.code or 0, out, err)
+
+    return run

@@ -185,5 +185,3 @@ def with_voxels(config: Config, scale: Scale) -> Config:
     low, high = config.fusion.voxel_low or VOXEL_LOW_M, config.fusion.voxel_high or VOXEL_HIGH_M
     fusion = dataclasses.replace(config.fusion, voxel_low=scale.units(low), voxel_high=scale.units(high))
     return dataclasses.replace(config, fusion=fusion)
-
-

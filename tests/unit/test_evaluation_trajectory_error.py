@@ -51,6 +51,7 @@ def evo_path(trajectory):
 
 
 EVO_ALIGN = {
+    Alignment.NONE: lambda estimate, truth: None,
     Alignment.SIM3: lambda estimate, truth: estimate.align(truth, correct_scale=True),
     Alignment.SE3: lambda estimate, truth: estimate.align(truth),
     Alignment.SCALE: lambda estimate, truth: (estimate.align(truth, correct_only_scale=True), estimate.align_origin(truth)),

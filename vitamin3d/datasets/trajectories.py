@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """Trajectory files: TUM, EuRoC states, KITTI poses. All come out as camera-to-world poses."""
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from pathlib import Path
 
 import numpy as np
@@ -15,11 +15,15 @@ EUROC_COLUMNS = "timestamp_ns px py pz qw qx qy qz"
 KITTI_COLUMNS = "r11 r12 r13 tx r21 r22 r23 ty r31 r32 r33 tz"
 
 
-def read_tum(path: Path) -> Trajectory:
-    """A TUM trajectory, `t tx ty tz qx qy qz qw` per line, seconds, camera to world; times exact to the nanosecond."""
+def read_tum(path: Path, time_of: Callable[[Row], int] = row_seconds) -> Trajectory:
+    """A TUM trajectory, `t tx ty tz qx qy qz qw` per line, camera to world; times exact to the nanosecond.
+
+    Args:
+        time_of: nanoseconds of a row; by default its first field is in seconds.
+    """
     rows = list(rows_of(path, TUM_COLUMNS))
     poses = [_pose(row, numbers[:3], numbers[3:]) for row in rows for numbers in [row.numbers(row.fields[1:8])]]
-    return _trajectory([row_seconds(row) for row in rows], poses, rows)
+    return _trajectory([time_of(row) for row in rows], poses, rows)
 
 
 def read_euroc_states(path: Path, T_body_cam: Array) -> Trajectory:

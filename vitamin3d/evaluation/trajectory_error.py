@@ -27,6 +27,12 @@ class Alignment(Enum):
     """Rotation and translation by least squares: the estimate's own scale counts."""
     SCALE = "scale, first pose"
     """The scale of Sim(3), then the first poses put on each other: drift from the start counts (evo's `-s --align_origin`)."""
+    NONE = "no alignment"
+    """Positions as they are: for two trajectories of one world, where the camera hardly moved."""
+
+
+FITTED = (Alignment.SIM3, Alignment.SE3, Alignment.SCALE)
+"""The alignments that need a camera that moves."""
 
 
 @dataclass(frozen=True)
@@ -68,6 +74,8 @@ def alignment_between(estimate: Trajectory, truth: Trajectory, alignment: Alignm
     Raises:
         InputError: fewer than three pairs, or an estimate that stands still.
     """
+    if alignment is Alignment.NONE:
+        return 1.0, np.eye(3), np.zeros(3)
     source, target = estimate.T_world_cam[:, :3, 3], truth.T_world_cam[:, :3, 3]
     s, R, t = align_sim3(source, target)
     if alignment is Alignment.SIM3:
@@ -89,8 +97,22 @@ def aligned(estimate: Trajectory, truth: Trajectory, alignment: Alignment) -> Tr
 
 def absolute_errors(estimate: Trajectory, truth: Trajectory, alignment: Alignment) -> Array:
     """ATE: distances (T,) between the camera centres of two trajectories, paired by row, after the alignment."""
-    placed = aligned(estimate, truth, alignment)
-    return np.asarray(np.linalg.norm(placed.T_world_cam[:, :3, 3] - truth.T_world_cam[:, :3, 3], axis=1))
+    return np.asarray(np.linalg.norm(position_errors(aligned(estimate, truth, alignment), truth), axis=1))
+
+
+def position_errors(placed: Trajectory, truth: Trajectory) -> Array:
+    """Differences (T, 3) of the camera centres along the axes of the truth's world, estimate less truth, paired by row."""
+    return np.asarray(placed.T_world_cam[:, :3, 3] - truth.T_world_cam[:, :3, 3])
+
+
+def orientation_errors_deg(placed: Trajectory, truth: Trajectory) -> Array:
+    """Angles (T,) in degrees between the orientations of two trajectories, paired by row."""
+    return rotation_angles_deg(np.swapaxes(truth.T_world_cam[:, :3, :3], 1, 2) @ placed.T_world_cam[:, :3, :3])
+
+
+def running_rmse(errors: Array) -> Array:
+    """RMSE (T,) of the errors (T,) up to and with each (the paper's Fig. 4 over time)."""
+    return np.asarray(np.sqrt(np.cumsum(errors**2) / np.arange(1, len(errors) + 1)))
 
 
 def relative_errors(estimate: Trajectory, truth: Trajectory, pairs: Array) -> tuple[Array, Array]:
@@ -119,6 +141,12 @@ def pairs_by_frames(frame_indices: Array, distance: int) -> Array:
     """Rows (P, 2) of all poses exactly `distance` frames apart; frame_indices (T,) ascending, of the poses."""
     _, first, second = np.intersect1d(frame_indices + distance, frame_indices, assume_unique=True, return_indices=True)
     return np.stack([first, second], axis=1)
+
+
+def pairs_by_time(timestamps_ns: Array, interval_ns: int, tolerance_ns: int = MATCH_TOLERANCE_NS) -> Array:
+    """Rows (P, 2): from each pose the one nearest to `interval_ns` later, within the tolerance; timestamps_ns (T,) ascending."""
+    i, j = match_timestamps(timestamps_ns + interval_ns, timestamps_ns, tolerance_ns)
+    return np.stack([i, j], axis=1)[j > i]
 
 
 def pairs_by_travelled_distance(positions: Array, distance: float, tolerance: float = DISTANCE_TOLERANCE) -> Array:

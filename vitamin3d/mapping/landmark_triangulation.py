@@ -31,9 +31,7 @@ def triangulate_landmarks(sparse_map: SparseMap, camera: Camera, config: Triangu
     return int(good.sum())
 
 
-def _two_ray_points(
-    sparse_map: SparseMap, first: Array, newest: Array, camera: Camera, config: TriangulationConfig
-) -> tuple[Array, Array]:
+def _two_ray_points(sparse_map: SparseMap, first: Array, newest: Array, camera: Camera, config: TriangulationConfig) -> tuple[Array, Array]:
     """World points (N, 3) of two observations each, and which of them (N,) pass the gates."""
     T_a_world = sparse_map.T_cam_world[sparse_map.keyframe_of(first)]
     T_b_world = sparse_map.T_cam_world[-1]

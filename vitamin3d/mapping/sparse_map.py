@@ -188,4 +188,3 @@ class SparseMap:
     def clone_pose(self, keyframe: int) -> Array:
         """T_cam_world (4, 4) of a keyframe, a copy."""
         return np.array(self._poses.view[keyframe])
-

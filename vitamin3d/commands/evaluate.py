@@ -1,0 +1,63 @@
+# SPDX-License-Identifier: Apache-2.0
+"""`vitamin3d evaluate`: a run, or any trajectory, against its ground truth."""
+
+from enum import Enum
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from vitamin3d.commands.process import one_thread_each
+
+
+class Format(str, Enum):
+    """Formats of trajectory files."""
+
+    tum = "tum"
+    euroc = "euroc"
+    kitti = "kitti"
+
+
+class FrameOfTruth(str, Enum):
+    """What a ground truth is of."""
+
+    auto = "auto"
+    camera = "camera"
+    body = "body"
+
+
+def evaluate(
+    run: Annotated[Path, typer.Argument(help="Folder of a finished run, or a trajectory file (TUM, EuRoC, KITTI).")],
+    ground_truth: Annotated[
+        Path | None, typer.Option("--ground-truth", "-g", help="Trajectory file, or the folder of the sequence, which may bring one.")
+    ] = None,
+    source: Annotated[Path | None, typer.Option(help="The sequence, where --ground-truth is a file: T_BS, frames, tracks.")] = None,
+    calibration: Annotated[Path | None, typer.Option(help="Camera file, where the sequence brings none; may hold T_BS.")] = None,
+    format: Annotated[Format | None, typer.Option(help="Of the ground-truth file; by default it is recognised.")] = None,
+    times: Annotated[Path | None, typer.Option(help="KITTI's times.txt, where it is not beside the poses.")] = None,
+    truth_frame: Annotated[FrameOfTruth, typer.Option(help="What the truth is of; auto: recognised, T_BS applied.")] = FrameOfTruth.auto,
+    time_offset: Annotated[float, typer.Option(help="Seconds added to the times of the run.")] = 0.0,
+    out: Annotated[Path | None, typer.Option("--out", "-o", help="Folder for JSON, table and plots; default: RUN/evaluation.")] = None,
+    json: Annotated[bool, typer.Option("--json", help="Print JSON instead of the table.")] = False,
+) -> None:
+    """Score a trajectory: success rate, ATE, RPE, errors per axis and over time; names the frame and the alignment."""
+    one_thread_each()
+    from vitamin3d.evaluation.evaluation_files import write_evaluation
+    from vitamin3d.evaluation.evaluation_text import as_json, table
+    from vitamin3d.evaluation.finished_run import TruthRequest, read_run, read_sequence, read_truth
+    from vitamin3d.evaluation.reference_frame import TruthFrame
+    from vitamin3d.evaluation.run_evaluation import evaluate as figures
+
+    dataset = read_sequence(ground_truth, source, calibration)
+    frame = None if truth_frame is FrameOfTruth.auto else TruthFrame(truth_frame.value)
+    request = TruthRequest(ground_truth, source, calibration, format.value if format else None, times, frame)
+    finished = read_run(run, times=times)
+    truth = read_truth(request, dataset)
+    offset_ns = round(time_offset * 1e9)
+    report = figures(finished, truth, dataset, offset_ns)
+    folder = out or (run / "evaluation" if run.is_dir() else None)
+    typer.echo(as_json(report) if json else table(report), nl=not json)
+    if folder is not None:
+        written = write_evaluation(folder, report, finished, truth, offset_ns)
+        if not json:
+            typer.echo("\n" + "\n".join(f"  {path}" for path in written))
