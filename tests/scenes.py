@@ -8,10 +8,10 @@ from pathlib import Path
 import cv2
 import numpy as np
 
+from vitamin3d.bundle_adjustment.problem import BundleProblem
 from vitamin3d.geometry.camera import Camera
 from vitamin3d.geometry.se3 import exp_se3
 from vitamin3d.mapping.sparse_map import SparseMap
-from vitamin3d.mapping.window_selection import BundleProblem
 
 DEMO = Path(__file__).parents[1] / "data" / "demo"
 PINHOLE = Camera(520.0, 510.0, 321.5, 239.0, 640, 480)

@@ -8,6 +8,7 @@ from dataclasses import replace
 
 import numpy as np
 
+from vitamin3d.bundle_adjustment.problem import BundleProblem
 from vitamin3d.config import Config
 from vitamin3d.geometry.camera import Camera
 from vitamin3d.geometry.se3 import inverse
@@ -23,7 +24,7 @@ from vitamin3d.mapping.relocalization import relocalize
 from vitamin3d.mapping.sparse_map import SparseMap
 from vitamin3d.mapping.subspace_bundle_adjustment import adjust_bundle, adjust_schur, adjust_subspace, squared_reprojection_errors
 from vitamin3d.mapping.two_view_initialization import initialize_from_two_views
-from vitamin3d.mapping.window_selection import BundleProblem, Window, build_problem, select_frame_window, select_window, store_solution
+from vitamin3d.mapping.window_selection import Window, build_problem, select_frame_window, select_window, store_solution
 from vitamin3d.tracking.extrema import refine_extrema, select_free_extrema
 from vitamin3d.tracking.extrema_tracking import predict_by_dense_flow, predict_by_dominant_flow, track_extrema
 from vitamin3d.types import Array, Frame, FrontEndFrame, MapSnapshot, SlamState, StepTimes, Tracks, Trajectory

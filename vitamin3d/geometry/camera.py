@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """The pinhole camera with radial-tangential distortion (Brown–Conrady, OpenCV's k1 k2 p1 p2, EuRoC's `sensor.yaml`)."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import cv2
 import numpy as np
@@ -14,7 +14,8 @@ NEWTON_TOLERANCE = 1e-10
 
 
 @inlined
-def _distort(x, y, k1, k2, p1, p2):  # type: ignore[no-untyped-def]
+def distort(x, y, k1, k2, p1, p2):  # type: ignore[no-untyped-def]
+    """Normalised distorted coordinates of normalised ideal ones."""
     r2 = x * x + y * y
     radial = 1.0 + r2 * (k1 + r2 * k2)
     return x * radial + 2.0 * p1 * x * y + p2 * (r2 + 2.0 * x * x), y * radial + p1 * (r2 + 2.0 * y * y) + 2.0 * p2 * x * y
@@ -24,7 +25,7 @@ def _distort(x, y, k1, k2, p1, p2):  # type: ignore[no-untyped-def]
 def _distort_normalized(points, coefficients, out):  # type: ignore[no-untyped-def]
     k1, k2, p1, p2 = coefficients
     for i in range(points.shape[0]):
-        out[i, 0], out[i, 1] = _distort(points[i, 0], points[i, 1], k1, k2, p1, p2)
+        out[i, 0], out[i, 1] = distort(points[i, 0], points[i, 1], k1, k2, p1, p2)
 
 
 @kernel
@@ -36,7 +37,7 @@ def _undistort_normalized(points, coefficients, steps, tolerance, out):  # type:
         x, y = xd, yd
         error = np.inf
         for _ in range(steps):
-            fx, fy = _distort(x, y, k1, k2, p1, p2)
+            fx, fy = distort(x, y, k1, k2, p1, p2)
             ex, ey = fx - xd, fy - yd
             error = ex * ex + ey * ey
             if error < tolerance * tolerance:
@@ -80,6 +81,16 @@ class Camera:
     def intrinsics(self) -> Array:
         """(4,) fx fy cx cy, for the kernels."""
         return np.array([self.fx, self.fy, self.cx, self.cy])
+
+    @property
+    def model(self) -> Array:
+        """(8,) fx fy cx cy k1 k2 p1 p2, for the kernels."""
+        return np.array([self.fx, self.fy, self.cx, self.cy, *self.distortion])
+
+    def with_model(self, model: Array) -> "Camera":
+        """A camera with the same picture and `model` (8,) fx fy cx cy k1 k2 p1 p2."""
+        fx, fy, cx, cy, k1, k2, p1, p2 = (float(value) for value in model)
+        return replace(self, fx=fx, fy=fy, cx=cx, cy=cy, distortion=(k1, k2, p1, p2))
 
     @property
     def is_distorted(self) -> bool:

@@ -7,6 +7,7 @@ Residual r = projection(T_cam_world X) - u, pixels. The pose moves by `exp_se3([
 import numpy as np
 
 from vitamin3d._jit import inlined, kernel
+from vitamin3d.geometry.camera import distort
 from vitamin3d.types import Array
 
 MIN_DEPTH = 1e-6
@@ -34,6 +35,53 @@ def linearize(intrinsics, R, t, X, pixel, r, J_pose, J_point):  # type: ignore[n
         J_point[0, k] = gx * (R[0, k] - a * R[2, k])
         J_point[1, k] = gy * (R[1, k] - b * R[2, k])
     return True
+
+
+@inlined
+def linearize_distorted(model, R, t, X, pixel, r, J_pose, J_point, J_model):  # type: ignore[no-untyped-def]
+    """Like `linearize` for a distorted pixel and the camera's `model` fx fy cx cy k1 k2 p1 p2; J_model (2, 8) is by these."""
+    x = R[0, 0] * X[0] + R[0, 1] * X[1] + R[0, 2] * X[2] + t[0]
+    y = R[1, 0] * X[0] + R[1, 1] * X[1] + R[1, 2] * X[2] + t[1]
+    z = R[2, 0] * X[0] + R[2, 1] * X[1] + R[2, 2] * X[2] + t[2]
+    if z < MIN_DEPTH:
+        return False
+    q = 1.0 / z
+    a, b = x * q, y * q
+    fx, fy, k1, k2, p1, p2 = model[0], model[1], model[4], model[5], model[6], model[7]
+    a2, ab, b2 = a * a, a * b, b * b
+    r2 = a2 + b2
+    radial, slope = 1.0 + r2 * (k1 + r2 * k2), 2.0 * k1 + 4.0 * k2 * r2
+    u, v = a * radial + 2.0 * p1 * ab + p2 * (r2 + 2.0 * a2), b * radial + p1 * (r2 + 2.0 * b2) + 2.0 * p2 * ab
+    r[0], r[1] = fx * u + model[2] - pixel[0], fy * v + model[3] - pixel[1]
+    mixed = ab * slope + 2.0 * p1 * a + 2.0 * p2 * b
+    ua, ub, va = fx * (radial + a2 * slope + 2.0 * p1 * b + 6.0 * p2 * a), fx * mixed, fy * mixed
+    vb = fy * (radial + b2 * slope + 6.0 * p1 * b + 2.0 * p2 * a)
+    J_pose[0, 0], J_pose[0, 1], J_pose[0, 2] = q * ua, q * ub, -q * (ua * a + ub * b)
+    J_pose[0, 3], J_pose[0, 4], J_pose[0, 5] = -ua * ab - ub * (1.0 + b2), ua * (1.0 + a2) + ub * ab, ub * a - ua * b
+    J_pose[1, 0], J_pose[1, 1], J_pose[1, 2] = q * va, q * vb, -q * (va * a + vb * b)
+    J_pose[1, 3], J_pose[1, 4], J_pose[1, 5] = -va * ab - vb * (1.0 + b2), va * (1.0 + a2) + vb * ab, vb * a - va * b
+    for m in range(2):
+        for k in range(3):
+            J_point[m, k] = J_pose[m, 0] * R[0, k] + J_pose[m, 1] * R[1, k] + J_pose[m, 2] * R[2, k]
+    J_model[0, 0], J_model[0, 1], J_model[0, 2], J_model[0, 3] = u, 0.0, 1.0, 0.0
+    J_model[1, 0], J_model[1, 1], J_model[1, 2], J_model[1, 3] = 0.0, v, 0.0, 1.0
+    J_model[0, 4], J_model[0, 5], J_model[0, 6], J_model[0, 7] = fx * a * r2, fx * a * r2 * r2, 2.0 * fx * ab, fx * (r2 + 2.0 * a2)
+    J_model[1, 4], J_model[1, 5], J_model[1, 6], J_model[1, 7] = fy * b * r2, fy * b * r2 * r2, fy * (r2 + 2.0 * b2), 2.0 * fy * ab
+    return True
+
+
+@inlined
+def squared_error_distorted(model, R, t, X, pixel):  # type: ignore[no-untyped-def]
+    """|r|² in pixels² of a distorted pixel, infinite behind the camera."""
+    z = R[2, 0] * X[0] + R[2, 1] * X[1] + R[2, 2] * X[2] + t[2]
+    if z < MIN_DEPTH:
+        return np.inf
+    q = 1.0 / z
+    a = q * (R[0, 0] * X[0] + R[0, 1] * X[1] + R[0, 2] * X[2] + t[0])
+    b = q * (R[1, 0] * X[0] + R[1, 1] * X[1] + R[1, 2] * X[2] + t[1])
+    u, v = distort(a, b, model[4], model[5], model[6], model[7])
+    du, dv = model[0] * u + model[2] - pixel[0], model[1] * v + model[3] - pixel[1]
+    return du * du + dv * dv
 
 
 @inlined

@@ -12,11 +12,11 @@ import dataclasses
 import numpy as np
 
 from vitamin3d._jit import inlined, kernel
+from vitamin3d.bundle_adjustment.problem import BundleProblem
 from vitamin3d.config import BundleAdjustmentConfig
 from vitamin3d.geometry.camera import Camera
 from vitamin3d.geometry.reprojection import linearize, retract, squared_error
 from vitamin3d.geometry.robust import geman_mcclure_cost, geman_mcclure_weight
-from vitamin3d.mapping.window_selection import BundleProblem
 from vitamin3d.types import Array, BundleReport
 
 BLOCK_DAMPING = 1e-9

@@ -10,6 +10,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from vitamin3d._jit import kernel
+from vitamin3d.bundle_adjustment.problem import BundleProblem, order_by_point
 from vitamin3d.config import WindowConfig
 from vitamin3d.mapping.sparse_map import SparseMap
 from vitamin3d.types import Array
@@ -52,21 +53,6 @@ def _gather(keyframes, num_window, starts, obs_landmark, obs_valid, first, point
     return num_points, num_obs
 
 
-@kernel
-def _order_by_point(obs_point, num_points, starts, order):  # type: ignore[no-untyped-def]
-    """Counting sort: observations of point p are order[starts[p]:starts[p + 1]], cameras ascending."""
-    starts[:] = 0
-    for i in range(obs_point.shape[0]):
-        starts[obs_point[i] + 1] += 1
-    for p in range(num_points):
-        starts[p + 1] += starts[p]
-    cursor = starts.copy()
-    for i in range(obs_point.shape[0]):
-        p = obs_point[i]
-        order[cursor[p]] = i
-        cursor[p] += 1
-
-
 @dataclass(frozen=True)
 class Window:
     """The keyframes of one adjustment."""
@@ -76,32 +62,6 @@ class Window:
     num_adjusted: int
     num_fixed: int
     """So many of the first adjusted ones are held fixed too, where there are no anchors to hold the gauge."""
-
-
-@dataclass(frozen=True)
-class BundleProblem:
-    """Cameras, points and observations of one adjustment (Eq. 6); observations sorted by camera."""
-
-    T_cam_world: Array
-    """(C, 4, 4)."""
-    camera_is_free: Array
-    """(C,) bool."""
-    points_world: Array
-    """(P, 3)."""
-    obs_camera: Array
-    """(M,) int32, ascending."""
-    obs_point: Array
-    """(M,) int32."""
-    obs_pixels: Array
-    """(M, 2) ideal pixels."""
-    point_starts: Array
-    """(P + 1,) int64: the observations of point p are point_order[point_starts[p]:point_starts[p + 1]]."""
-    point_order: Array
-    """(M,) int64."""
-    landmark_ids: Array
-    """(P,) int64."""
-    obs_rows: Array
-    """(M,) int64, index of the observation in the map; -1: of the frame that is no keyframe."""
 
 
 def select_window(sparse_map: SparseMap, config: WindowConfig) -> Window:
@@ -161,7 +121,7 @@ def build_problem(sparse_map: SparseMap, window: Window, view: tuple[Array, Arra
         pixels = np.concatenate([pixels, view_pixels[known]])
         poses, is_free = np.concatenate([poses, T_view[None]]), np.append(is_free, True)
     point_starts, order = np.empty(num_points + 1, np.int64), np.empty(len(obs_point), np.int64)
-    _order_by_point(obs_point, num_points, point_starts, order)
+    order_by_point(obs_point, num_points, point_starts, order)
     points = sparse_map.points_world[ids]
     return BundleProblem(poses, is_free, points, obs_camera, obs_point, pixels, point_starts, order, ids, rows)
 
