@@ -22,6 +22,7 @@ CHOICES = {
     "extrema_tracking.prediction": ("dense_flow", "dominant_flow"),
     "bundle_adjustment.keyframe_solver": ("schur", "subspace"),
     "fusion.backend": ("scalable", "voxel_block_grid"),
+    "calibration.refine": ("auto", "on", "off"),
 }
 AT_LEAST_ONE = (
     "extrema.refill_interval",
@@ -224,6 +225,32 @@ class FinalAdjustmentConfig:
 
 
 @dataclass(frozen=True)
+class CalibrationConfig:
+    """The camera's parameters as variables of adjustments of the whole map."""
+
+    refine: str = "auto"
+    """`auto`: where the motion determines them; `on`: whatever comes out; `off`."""
+    parameters: str = "f k1"
+    """Free ones out of f fx fy cx cy k1 k2 p1 p2; `f` moves fx and fy together."""
+    first_keyframes: int = 20
+    growth: float = 1.5
+    """The next refinement is due when the map has grown by this factor; one more comes at the end."""
+    points_per_keyframe: int = 400
+    """Landmarks with the most observations that take part, about so many in each keyframe."""
+    sigma_px: float = 1.0
+    iterations: int = 25
+    prior_focal: float = 0.05
+    """Standard deviation of the focal length around the one before, relative."""
+    prior_distortion: float = 0.1
+    systematic_factor: float = 10.0
+    """True deviations over those of independent errors: rolling shutter, tracks cut short, the model of the lens."""
+    max_focal_deviation: float = 0.01
+    """Relative, systematic errors included; above it the motion does not determine the focal length."""
+    max_change: float = 0.25
+    """Of the focal length from the given one, relative."""
+
+
+@dataclass(frozen=True)
 class CloudConfig:
     """Filter of the exported cloud."""
 
@@ -326,6 +353,7 @@ class Config:
     window: WindowConfig = field(default_factory=WindowConfig)
     bundle_adjustment: BundleAdjustmentConfig = field(default_factory=BundleAdjustmentConfig)
     final_adjustment: FinalAdjustmentConfig = field(default_factory=FinalAdjustmentConfig)
+    calibration: CalibrationConfig = field(default_factory=CalibrationConfig)
     cloud: CloudConfig = field(default_factory=CloudConfig)
     snapshot: SnapshotConfig = field(default_factory=SnapshotConfig)
     delaunay: DelaunayConfig = field(default_factory=DelaunayConfig)
@@ -346,6 +374,7 @@ def paper_config() -> Config:
         relocalization=RelocalizationConfig(enabled=False),
         window=WindowConfig(anchors=0),
         final_adjustment=FinalAdjustmentConfig(enabled=False),
+        calibration=CalibrationConfig(refine="off"),
         bundle_adjustment=BundleAdjustmentConfig(keyframe_solver="subspace", keyframe_iterations=20),
     )
 

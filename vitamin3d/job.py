@@ -91,6 +91,7 @@ def reconstruct_sequence(dataset: Dataset, job: Job, output: OutputFolder, obser
         raise
     slam.finish()
     if slam.map.num_keyframes and not job.live:
+        dense.camera = slam.camera
         dense.scale = scale = scale_from_ground_truth(slam.trajectory(), dataset.ground_truth()) if job.scale_from_truth else scale
         dense.add_all(slam, observer)
     cloud_points = _write_sparse(slam, scale, output, job)
@@ -136,7 +137,7 @@ class _Dense:
     """The dense half and its files; open3d is loaded when the first keyframe comes."""
 
     def __init__(self, dataset: Dataset, job: Job, output: OutputFolder, scale: Scale) -> None:
-        self.dataset, self.job, self.output, self.scale = dataset, job, output, scale
+        self.dataset, self.job, self.output, self.scale, self.camera = dataset, job, output, scale, dataset.camera
         self.reconstruction: Reconstruction | None = None
 
     def add(self, snapshot: MapSnapshot) -> None:
@@ -162,7 +163,7 @@ class _Dense:
 
     def _begun(self) -> Reconstruction:
         if self.reconstruction is None:
-            self.reconstruction = Reconstruction(self.dataset.camera, with_voxels(self.job.config, self.scale))
+            self.reconstruction = Reconstruction(self.camera, with_voxels(self.job.config, self.scale))
             self.output.write_canvas(self.reconstruction.canvas, self.scale)
         return self.reconstruction
 

@@ -12,6 +12,7 @@ from vitamin3d.bundle_adjustment.problem import BundleProblem
 from vitamin3d.config import Config
 from vitamin3d.geometry.camera import Camera
 from vitamin3d.geometry.se3 import inverse
+from vitamin3d.mapping.calibration_refinement import CalibrationRefinement
 from vitamin3d.mapping.initialization_history import InitializationHistory, TrackedView
 from vitamin3d.mapping.keyframe_selection import is_keyframe
 from vitamin3d.mapping.landmark_recovery import cut_patches, patch_similarity, recover_landmarks
@@ -24,7 +25,7 @@ from vitamin3d.mapping.relocalization import relocalize
 from vitamin3d.mapping.sparse_map import SparseMap
 from vitamin3d.mapping.subspace_bundle_adjustment import adjust_bundle, adjust_schur, adjust_subspace, squared_reprojection_errors
 from vitamin3d.mapping.two_view_initialization import initialize_from_two_views
-from vitamin3d.mapping.window_selection import Window, build_problem, select_frame_window, select_window, store_solution
+from vitamin3d.mapping.window_selection import Window, build_problem, select_frame_window, select_window, store_solution, whole_map
 from vitamin3d.tracking.extrema import refine_extrema, select_free_extrema
 from vitamin3d.tracking.extrema_tracking import predict_by_dense_flow, predict_by_dominant_flow, track_extrema
 from vitamin3d.types import Array, Frame, FrontEndFrame, MapSnapshot, SlamState, StepTimes, Tracks, Trajectory
@@ -46,6 +47,7 @@ class Slam:
         self.poses = PoseLog()
         self.times = StepTimes()
         self.initialization_reason, self.initialization_retries = "no frame was read", 0
+        self.calibration = CalibrationRefinement(camera, config.calibration)
         self._history = InitializationHistory(config.initialization)
         self._pending_frames: dict[int, Frame] = {}
         self._next_id = 0
@@ -212,6 +214,7 @@ class Slam:
             keyframe = self._add_keyframe(front, T_cam_world)
             triangulate_landmarks(self.map, self.camera, self.config.triangulation)
             self._adjust_window()
+            self._refine_calibration_when_due()
             self.poses.add(front.frame, keyframe, np.eye(4))
         else:
             T_cam_world = self._adjust_with_frame(T_cam_world)
@@ -241,6 +244,15 @@ class Slam:
             store_solution(self.map, window, solved)
             self._remove_outliers(window, solved, self.config.bundle_adjustment.outlier_px)
 
+    def _refine_calibration_when_due(self) -> None:
+        if self.calibration.is_due(self.map.num_keyframes):
+            self._refine_calibration()
+
+    def _refine_calibration(self) -> None:
+        """The camera's parameters from all of the map (or as they were); the map moves along."""
+        with self._timed("self_calibration"):
+            self.camera = self.calibration.refine(self.map, self.camera)
+
     def _remove_outliers(self, window: Window, solved: BundleProblem, limit_px: float) -> None:
         is_outlier = squared_reprojection_errors(solved, self.camera) > limit_px**2
         is_newest = solved.obs_camera == window.num_adjusted - 1
@@ -267,7 +279,9 @@ class Slam:
         window_round, final = self.config.bundle_adjustment, self.config.final_adjustment
         if not final.enabled or not 2 < self.map.num_keyframes <= final.max_keyframes:
             return
-        everything = Window(np.arange(self.map.num_keyframes), self.map.num_keyframes, 1)
+        if self.calibration.is_enabled:
+            self._refine_calibration()
+        everything = whole_map(self.map)
         with self._timed("final_adjustment"):
             for sigma, outlier in ((window_round.sigma_px, window_round.outlier_px), (final.sigma_px, final.outlier_px)):
                 problem = build_problem(self.map, everything)

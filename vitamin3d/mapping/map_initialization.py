@@ -14,7 +14,7 @@ from vitamin3d.mapping.p3p_localization import localize
 from vitamin3d.mapping.sparse_map import SparseMap
 from vitamin3d.mapping.subspace_bundle_adjustment import adjust_schur, squared_reprojection_errors
 from vitamin3d.mapping.two_view_initialization import median_motion
-from vitamin3d.mapping.window_selection import Window, build_problem, store_solution
+from vitamin3d.mapping.window_selection import build_problem, store_solution, whole_map
 from vitamin3d.types import Array, Frame, TwoView
 
 ADJUSTMENT_ITERATIONS = 20
@@ -83,7 +83,7 @@ def _add_between(sparse_map: SparseMap, view: TrackedView, last: TrackedView, ca
 def _adjust_all(sparse_map: SparseMap, camera: Camera, config: Config) -> bool:
     """Two adjustments of the whole young map with outliers removed between; whether it is sound."""
     triangulate_landmarks(sparse_map, camera, config.triangulation)
-    window = Window(np.arange(sparse_map.num_keyframes), sparse_map.num_keyframes, 1)
+    window = whole_map(sparse_map)
     rmse = np.inf
     for _ in range(2):
         solved, report = adjust_schur(build_problem(sparse_map, window), camera, config.bundle_adjustment.sigma_px, ADJUSTMENT_ITERATIONS)

@@ -82,6 +82,11 @@ def select_frame_window(sparse_map: SparseMap, adjusted: int, size: int) -> Wind
     return Window(keyframes, count - first, 0 if oldest < first else min(1, count - 1))
 
 
+def whole_map(sparse_map: SparseMap) -> Window:
+    """All keyframes, the first held fixed."""
+    return Window(np.arange(sparse_map.num_keyframes), sparse_map.num_keyframes, 1)
+
+
 def _anchors(sparse_map: SparseMap, oldest: int, config: WindowConfig) -> Array:
     starts = np.array(sparse_map.keyframe_starts)
     marked = np.zeros(len(sparse_map.points_world), np.bool_)
