@@ -11,7 +11,6 @@ from pathlib import Path
 
 import cv2
 import numpy as np
-from render_mesh import draw, stepped_aside, viewer
 
 from vitamin3d.datasets import Unreadable, open_dataset
 from vitamin3d.datasets.calibration import read_calibration
@@ -20,6 +19,7 @@ from vitamin3d.errors import InputError, Vitamin3dError
 from vitamin3d.exporters.files import write_file
 from vitamin3d.exporters.mesh import read_ply
 from vitamin3d.exporters.normal_map import NormalCaster
+from vitamin3d.exporters.rendering import draw, stepped_aside, viewer
 from vitamin3d.geometry.se3 import inverse
 from vitamin3d.types import Array
 

@@ -20,13 +20,10 @@ from vitamin3d.datasets.trajectories import read_tum
 from vitamin3d.errors import InputError, Vitamin3dError
 from vitamin3d.exporters.depth_map import write_png
 from vitamin3d.exporters.mesh import read_ply
-from vitamin3d.exporters.normal_map import NormalCaster, rgb_from_normals
-from vitamin3d.geometry.camera import Camera
+from vitamin3d.exporters.normal_map import NormalCaster
+from vitamin3d.exporters.rendering import draw, stepped_aside, viewer
 from vitamin3d.geometry.se3 import inverse
 from vitamin3d.types import Array
-
-BACKGROUND = np.array([255, 255, 255])
-AMBIENT = 0.35
 
 
 def parsed(argv: list[str] | None) -> argparse.Namespace:
@@ -41,36 +38,6 @@ def parsed(argv: list[str] | None) -> argparse.Namespace:
     parser.add_argument("--width", type=int, default=1200)
     parser.add_argument("--shading", choices=("color", "clay", "normals"), default="color")
     return parser.parse_args(argv)
-
-
-def viewer(canvas: Camera, width: int) -> Camera:
-    """The canvas camera, scaled to a picture of this width."""
-    s = width / canvas.width
-    return Camera(canvas.fx * s, canvas.fy * s, (canvas.cx + 0.5) * s - 0.5, (canvas.cy + 0.5) * s - 0.5, width, round(canvas.height * s))
-
-
-def stepped_aside(T_cam_world: Array, target_depth: float, right: float, up: float, back: float) -> Array:
-    """T_cam_world of a viewer who stepped aside, in lengths of the world, and looks at the point straight ahead of before."""
-    target, eye = np.array([0.0, 0.0, target_depth]), np.array([right, -up, -back])
-    z = (target - eye) / np.linalg.norm(target - eye)
-    x = np.cross([0.0, 1.0, 0.0], z)
-    x /= np.linalg.norm(x)
-    T_view_cam = np.eye(4)
-    T_view_cam[:3, :3] = np.stack([x, np.cross(z, x), z])
-    T_view_cam[:3, 3] = -T_view_cam[:3, :3] @ eye
-    return np.asarray(T_view_cam @ T_cam_world)
-
-
-def draw(caster: NormalCaster, camera: Camera, T_cam_world: Array, shading: str) -> Array:
-    """(H, W, 3) uint8 picture of the mesh, lit from the viewer."""
-    normals, colors = caster.cast(camera, T_cam_world), caster.cast_colors(camera, T_cam_world)
-    hit = (normals != 0).any(axis=-1)
-    if shading == "normals":
-        picture = rgb_from_normals(normals)
-    else:
-        base = colors if shading == "color" else np.full(colors.shape, 225.0)
-        picture = base * (AMBIENT + (1.0 - AMBIENT) * np.abs(normals[..., 2:]))
-    return np.where(hit[..., None], picture, BACKGROUND).clip(0, 255).astype(np.uint8)
 
 
 def main(argv: list[str] | None = None) -> int:

@@ -3,11 +3,16 @@
 
 from enum import Enum
 from pathlib import Path
-from typing import Annotated
+from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
 from vitamin3d.commands.process import one_thread_each
+from vitamin3d.errors import InputError
+
+if TYPE_CHECKING:
+    from vitamin3d.datasets import Dataset
+    from vitamin3d.evaluation.finished_run import Run, Truth
 
 
 class Format(str, Enum):
@@ -37,6 +42,10 @@ def evaluate(
     times: Annotated[Path | None, typer.Option(help="KITTI's times.txt, where it is not beside the poses.")] = None,
     truth_frame: Annotated[FrameOfTruth, typer.Option(help="What the truth is of; auto: recognised, T_BS applied.")] = FrameOfTruth.auto,
     time_offset: Annotated[float, typer.Option(help="Seconds added to the times of the run.")] = 0.0,
+    surface: Annotated[bool, typer.Option("--surface", help="Also score mesh and cloud against the sequence's depth maps.")] = False,
+    reference: Annotated[
+        Path | None, typer.Option(help="Score mesh and cloud against this scanner's cloud or mesh (EuRoC's data.ply).")
+    ] = None,
     out: Annotated[Path | None, typer.Option("--out", "-o", help="Folder for JSON, table and plots; default: RUN/evaluation.")] = None,
     json: Annotated[bool, typer.Option("--json", help="Print JSON instead of the table.")] = False,
 ) -> None:
@@ -55,9 +64,24 @@ def evaluate(
     truth = read_truth(request, dataset)
     offset_ns = round(time_offset * 1e9)
     report = figures(finished, truth, dataset, offset_ns)
+    if surface or reference is not None:
+        report["surface"] = _surface(finished, truth, dataset, source or ground_truth, reference)
     folder = out or (run / "evaluation" if run.is_dir() else None)
     typer.echo(as_json(report) if json else table(report), nl=not json)
     if folder is not None:
         written = write_evaluation(folder, report, finished, truth, offset_ns)
         if not json:
             typer.echo("\n" + "\n".join(f"  {path}" for path in written))
+
+
+def _surface(run: "Run", truth: "Truth | None", dataset: "Dataset | None", folder: Path | None, reference: Path | None) -> dict[str, Any]:
+    from vitamin3d.evaluation.surface_report import surface_report
+
+    if truth is None or dataset is None or folder is None:
+        raise InputError(
+            "a surface is scored in the world of the true trajectory; give the sequence's folder as --ground-truth or --source"
+        )
+    report = surface_report(run, truth, dataset, folder, reference)
+    if report is None:
+        raise InputError(f"{folder}: no depth maps (depth0/, depth.txt, frame-*.depth.png); give --reference with a true cloud or mesh")
+    return report

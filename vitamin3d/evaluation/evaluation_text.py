@@ -8,6 +8,7 @@ from typing import Any
 import numpy as np
 
 from vitamin3d.evaluation.run_evaluation import Pairing
+from vitamin3d.evaluation.surface_report import surface_lines
 from vitamin3d.evaluation.trajectory_error import Alignment, ErrorSummary, aligned
 from vitamin3d.exporters.line_plot import Axes, Line, line_plot
 
@@ -37,6 +38,7 @@ def table(report: dict[str, Any]) -> str:
     if report["retries"] is not None:
         lines += [f"map      initialised after {report['retries']} retries, {_scale(report)}"]
     lines += _error_lines(report) if "truth" in report else ["truth    none: no ATE, no RPE; give --ground-truth"]
+    lines += surface_lines(report["surface"]) if "surface" in report else []
     return "\n".join(lines + (_track_lines(report["tracks"]) if "tracks" in report else []))
 
 

@@ -32,7 +32,7 @@ FILES = (
     "stats.json",
     "tracks.npz",
 )
-FOLDERS = ("normals", "depth", "evaluation")
+FOLDERS = ("normals", "depth", "evaluation", "comparison")
 DEPTH_COUNTS_PER_METRE = 1000.0
 DEPTH_COUNTS_PER_UNIT = 5000.0
 PROGRAM = "vitamin3d"
