@@ -13,6 +13,7 @@ from vitamin3d.errors import InputError
 from vitamin3d.exporters.output_folder import OutputFolder
 from vitamin3d.mapping.landmark_statistics import point_cloud
 from vitamin3d.reconstruction import Reconstruction
+from vitamin3d.run_report import write_report
 from vitamin3d.run_statistics import Stopwatch, run_statistics
 from vitamin3d.runtime import Observer, RunRecord, run_ahead, run_sequential, run_threaded
 from vitamin3d.scale import Scale, scale_from_ground_truth
@@ -102,6 +103,7 @@ def reconstruct_sequence(dataset: Dataset, job: Job, output: OutputFolder, obser
     stats = run_statistics(slam, record, scale, cloud_points, times, watch)
     stats |= {"source": dataset.name, "mode": job.config.mode, "voxels": dense.voxels(), "skipped": [_line(s) for s in record.skipped]}
     output.write_stats(stats)
+    write_report(output.path, dataset, slam, record)
     return Outcome(slam, record, scale, stats)
 
 

@@ -9,6 +9,7 @@ from pathlib import Path
 import cv2
 import numpy as np
 import pytest
+from browser import opened
 
 from vitamin3d.config import Config, load_toml
 from vitamin3d.datasets import open_dataset
@@ -70,7 +71,7 @@ def test_surface_lies_on_the_true_one(demo_run: Path) -> None:
 def test_every_promised_file_is_there(demo_run: Path) -> None:
     names = {p.name for p in demo_run.iterdir()}
     expected = {"trajectory.tum", "keyframes.tum", "cloud.ply", "mesh_low.ply", "mesh_high.ply", "mesh_high.obj"}
-    assert names == expected | {"config.toml", "stats.json", "tracks.npz", "normals", "depth"}
+    assert names == expected | {"config.toml", "stats.json", "tracks.npz", "report.html", "normals", "depth"}
     assert load_toml(demo_run / "config.toml") == Config()
     stamps = [line.split()[0] for line in (demo_run / "keyframes.tum").read_text().splitlines() if not line.startswith("#")]
     maps = {p.stem for p in (demo_run / "normals").glob("*.png")}
@@ -158,6 +159,22 @@ def test_pipeline_on_a_page_does_the_same_job(tmp_path: Path) -> None:
     assert other.returncode == 0, other.stderr
     assert (tmp_path / "out" / "trajectory.tum").read_bytes() == (tmp_path / "cli" / "trajectory.tum").read_bytes()
     assert (tmp_path / "out" / "mesh_high.ply").read_bytes() == (tmp_path / "cli" / "mesh_high.ply").read_bytes()
+
+
+@pytest.mark.browser
+@pytest.mark.filterwarnings("ignore")
+def test_the_report_opens_offline_in_a_browser(demo_run: Path) -> None:
+    path = demo_run / "report.html"
+    assert 1_000_000 < path.stat().st_size <= 15_000_000
+    text = path.read_text()
+    assert text.count("data:image/jpeg") == 12 and "after Sim(3)" in text and "curvature extrema" in text
+    with opened(path) as page:
+        picture = page.picture()
+        assert page.evaluate("window.vitamin3dReport.triangles") > 50_000
+        assert (picture.std(axis=-1) > 8).mean() > 0.1, "blank"
+        page.drag("view", 200, 40)
+        assert (page.picture() != picture).any(axis=-1).mean() > 0.1
+        assert page.errors() == [] and page.requests() == []
 
 
 @pytest.mark.parametrize(

@@ -306,7 +306,7 @@ def test_a_wrong_input_does_not_touch_an_earlier_result(vitamin3d, tmp_path, out
     assert (out / "cloud.ply").read_text() == "precious"
 
 
-@pytest.mark.parametrize("victim", ["trajectory.tum", "cloud.ply", "mesh_high.ply", "stats.json", "canvas.yaml", "depth"])
+@pytest.mark.parametrize("victim", ["trajectory.tum", "cloud.ply", "mesh_high.ply", "stats.json", "report.html", "canvas.yaml", "depth"])
 def test_a_full_disk(vitamin3d, out, monkeypatch, victim):
     """The disk is full from the given file on."""
     opened, full = pathlib.Path.open, []
@@ -365,7 +365,7 @@ def test_a_standing_camera_gives_no_map(vitamin3d, tmp_path, out, threads):
     stats = json.loads((out / "stats.json").read_text())
     assert (stats["frames"], stats["keyframes"], stats["tracked_frames"], stats["interrupted"]) == (12, 0, 0, False)
     assert "no parallax" in stats["initialization_failure"]
-    assert sorted(path.name for path in out.iterdir()) == ["config.toml", "stats.json"]
+    assert sorted(path.name for path in out.iterdir()) == ["config.toml", "report.html", "stats.json"]
 
 
 def test_black_pictures_give_no_map(vitamin3d, tmp_path, out):

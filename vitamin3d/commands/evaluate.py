@@ -56,6 +56,7 @@ def evaluate(
     from vitamin3d.evaluation.finished_run import TruthRequest, read_run, read_sequence, read_truth
     from vitamin3d.evaluation.reference_frame import TruthFrame
     from vitamin3d.evaluation.run_evaluation import evaluate as figures
+    from vitamin3d.run_report import add_evaluation
 
     dataset = read_sequence(ground_truth, source, calibration)
     frame = None if truth_frame is FrameOfTruth.auto else TruthFrame(truth_frame.value)
@@ -70,6 +71,8 @@ def evaluate(
     typer.echo(as_json(report) if json else table(report), nl=not json)
     if folder is not None:
         written = write_evaluation(folder, report, finished, truth, offset_ns)
+        if truth is not None:
+            add_evaluation(run, finished, truth, report, offset_ns)
         if not json:
             typer.echo("\n" + "\n".join(f"  {path}" for path in written))
 

@@ -64,14 +64,14 @@ def _error_lines(report: dict[str, Any]) -> list[str]:
         lines += [f"         taken as it is, without T_BS, it would be {off} off"]
     if report["alignment"] == Alignment.NONE.value:
         lines += ["align    none: the true camera hardly moved, so that nothing can be fitted; both are taken to be in one world"]
-    lines += ["", f"{'ATE of the camera centres [cm]':32}{'RMSE':>10}{'median':>10}{'max':>10}"]
+    lines += ["", f"{'ATE of the camera centres [cm]':36}{'RMSE':>10}{'median':>10}{'max':>10}"]
     for name, errors in report["ate"].items():
         remark = f" (scale {report['scale']:.6g})" if name == Alignment.SIM3.value else ""
-        lines.append(f"{'after ' + name + remark:32}{_cells(ErrorSummary(**errors), CM)}")
+        lines.append(f"{'after ' + name + remark:36}{_cells(ErrorSummary(**errors), CM)}")
     for name, errors in report["axes"].items():
-        lines.append(f"{'  along ' + name:32}{_cells(ErrorSummary(**errors), CM)}")
-    lines.append(f"{'orientation [deg]':32}{_cells(ErrorSummary(**report['rotation_deg']), 1)}")
-    lines += ["", f"{'RPE after ' + report['alignment']:32}{'RMSE':>10}{'median':>10}{'max':>10}{'pairs':>10}"]
+        lines.append(f"{'  along ' + name:36}{_cells(ErrorSummary(**errors), CM)}")
+    lines.append(f"{'orientation [deg]':36}{_cells(ErrorSummary(**report['rotation_deg']), 1)}")
+    lines += ["", f"{'RPE after ' + report['alignment']:36}{'RMSE':>10}{'median':>10}{'max':>10}{'pairs':>10}"]
     for name, kinds in report["rpe"].items():
         lines += [_relative_line(f"{name}, translation [cm]", kinds["translation"], CM)]
         lines += [_relative_line(f"{name}, rotation [deg]", kinds["rotation_deg"], 1)]
@@ -79,7 +79,7 @@ def _error_lines(report: dict[str, Any]) -> list[str]:
 
 
 def _relative_line(name: str, errors: dict[str, Any], factor: float) -> str:
-    return f"{name:32}{_cells(ErrorSummary(**errors), factor)}{errors['count']:>10}"
+    return f"{name:36}{_cells(ErrorSummary(**errors), factor)}{errors['count']:>10}"
 
 
 def _cells(errors: ErrorSummary, factor: float) -> str:
@@ -91,9 +91,9 @@ def _track_lines(tracks: dict[str, Any]) -> list[str]:
         "",
         f"tracks   {tracks['num_tracks']}; live per frame: median {tracks['live_median']:.0f}, minimum {tracks['live_minimum']}; "
         f"length: median {tracks['length_median']:.0f}, p90 {tracks['length_p90']:.0f} frames",
-        f"{'age [frames]':32}{'survival':>10}{'epipolar inliers (Sampson < 1 px, poses: ' + tracks['poses'] + ')':>60}",
+        f"{'age [frames]':36}{'survival':>10}{'epipolar inliers (Sampson < 1 px, poses: ' + tracks['poses'] + ')':>58}",
     ]
-    return lines + [f"{a['age']:<32}{a['survival']:>10.3f}{a['epipolar_inlier_ratio']:>60.3f}" for a in tracks["ages"]]
+    return lines + [f"{a['age']:<36}{a['survival']:>10.3f}{a['epipolar_inlier_ratio']:>58.3f}" for a in tracks["ages"]]
 
 
 def plots(report: dict[str, Any], paired: Pairing) -> dict[str, str]:

@@ -31,6 +31,7 @@ FILES = (
     "config.toml",
     "stats.json",
     "tracks.npz",
+    "report.html",
 )
 FOLDERS = ("normals", "depth", "evaluation", "comparison")
 DEPTH_COUNTS_PER_METRE = 1000.0
