@@ -130,6 +130,14 @@ class BundleReport:
     num_observations: int
     rmse_px: float
     """Root mean square reprojection error of the observations below three sigmas."""
+    stopped: str = ""
+    """Why: `gain` (a step gained too little), `iterations`, `no descent`."""
+    gradient_norms: Array = field(default_factory=lambda: np.zeros(0))
+    """(I,) before each step: half the cost's derivative by all free variables."""
+    pose_steps: Array = field(default_factory=lambda: np.zeros(0))
+    """(I,) largest norm of a camera's tangent [translation, rotation] in each step."""
+    point_steps: Array = field(default_factory=lambda: np.zeros(0))
+    """(I,) largest distance that a point moved in each step, map units."""
 
 
 @dataclass(frozen=True)

@@ -6,25 +6,37 @@ import pytest
 from scenes import EUROC, PINHOLE, Scene, arc_scene, perturbed, problem_of, project
 
 from vitamin3d._jit import kernel
+from vitamin3d.bundle_adjustment.normal_equations import linearize_observation, observation_error
 from vitamin3d.bundle_adjustment.problem import points_of_long_tracks, select_points
 from vitamin3d.bundle_adjustment.self_calibration import adjust_with_intrinsics, calibration_basis
 from vitamin3d.errors import InputError
-from vitamin3d.geometry import reprojection
+from vitamin3d.geometry.reprojection import fill_model_derivatives
 from vitamin3d.geometry.se3 import exp_se3
 
-linearize_distorted, squared_error_distorted = reprojection.linearize_distorted, reprojection.squared_error_distorted
 SIGMA = 2.0
 LENS = EUROC.with_model([460.0, 455.0, 367.0, 248.0, -0.25, 0.06, 1e-3, -5e-4])
 
 
 @kernel
-def run_linearize(model, R, t, X, pixel, r, J_pose, J_point, J_model):
-    return linearize_distorted(model, R, t, X, pixel, r, J_pose, J_point, J_model)
+def run_linearize(models, is_distorted, R, t, points, pixels):
+    return linearize_observation(R, t, 0, models, 0, is_distorted, points, 0, pixels, 0)
 
 
 @kernel
-def run_squared_error(model, R, t, X, pixel):
-    return squared_error_distorted(model, R, t, X, pixel)
+def run_squared_error(models, is_distorted, R, t, points, pixels):
+    return observation_error(R, t, 0, models, 0, is_distorted, points, 0, pixels, 0)
+
+
+def linearized(model, T, X, pixel):
+    """r (2,), J_pose (2, 6), J_point (2, 3), J_model (2, 8) as the solvers put them together."""
+    R, t = np.ascontiguousarray(T[:3, :3]), np.ascontiguousarray(T[:3, 3])
+    scene = model[None], bool(model[4:].any()), R[None], t[None], X[None], pixel[None]
+    q, a, b, r0, r1, *p = run_linearize(*scene)
+    p, J_model = np.array(p).reshape(2, 2), np.empty((1, 2, 8))
+    assert run_squared_error(*scene) == pytest.approx(r0 * r0 + r1 * r1, rel=1e-12)
+    fill_model_derivatives(model[None], np.array([[a, b, 1.0]]), J_model)
+    J_pose = p @ [[q, 0, -q * a, -a * b, 1 + a * a, -b], [0, q, -q * b, -(1 + b * b), a * b, a]]
+    return np.array([r0, r1]), J_pose, J_pose[:, :3] @ R, J_model[0]
 
 
 def residual(model, T, X, pixel):
@@ -38,28 +50,25 @@ def central(function, at, size=1e-6):
     return np.column_stack([(function(at + d) - function(at - d)) / (2 * size) for d in steps])
 
 
-def test_residual_and_jacobians_equal_finite_differences(rng):
+@pytest.mark.parametrize("model", [LENS.model, PINHOLE.model])
+def test_residual_and_jacobians_equal_finite_differences(model, rng):
     for _ in range(10):
         T, pixel = exp_se3(0.3 * rng.standard_normal(6)), rng.uniform(0, 400, 2)
         X = np.linalg.inv(T)[:3] @ np.append(rng.uniform([-1, -1, 1.5], [1, 1, 5]), 1)
-        R, t = np.ascontiguousarray(T[:3, :3]), np.ascontiguousarray(T[:3, 3])
-        r, J_pose, J_point, J_model = np.empty(2), np.empty((2, 6)), np.empty((2, 3)), np.empty((2, 8))
-        assert run_linearize(LENS.model, R, t, X, pixel, r, J_pose, J_point, J_model)
-        np.testing.assert_allclose(r, residual(LENS.model, T, X, pixel), atol=1e-9)
-        assert run_squared_error(LENS.model, R, t, X, pixel) == pytest.approx(r @ r, rel=1e-12)
+        r, J_pose, J_point, J_model = linearized(model, T, X, pixel)
+        np.testing.assert_allclose(r, residual(model, T, X, pixel), atol=1e-9)
         size = np.abs(J_pose).max()
-        by_pose = central(lambda d, T=T, X=X, u=pixel: residual(LENS.model, exp_se3(d) @ T, X, u), np.zeros(6))
+        by_pose = central(lambda d, T=T, X=X, u=pixel: residual(model, exp_se3(d) @ T, X, u), np.zeros(6))
         np.testing.assert_allclose(J_pose, by_pose, atol=1e-6 * size)
-        np.testing.assert_allclose(J_point, central(lambda x, T=T, u=pixel: residual(LENS.model, T, x, u), X), atol=1e-6 * size)
-        by_model = central(lambda m, T=T, X=X, u=pixel: residual(m, T, X, u), LENS.model)
+        np.testing.assert_allclose(J_point, central(lambda x, T=T, u=pixel: residual(model, T, x, u), X), atol=1e-6 * size)
+        by_model = central(lambda m, T=T, X=X, u=pixel: residual(m, T, X, u), model)
         np.testing.assert_allclose(J_model, by_model, atol=1e-6 * np.abs(J_model).max())
 
 
 def test_behind_the_camera_there_is_no_residual():
-    X, pixel = np.array([0.1, 0.2, -1.0]), np.zeros(2)
-    r, J_pose, J_point, J_model = np.full(2, 7.0), np.empty((2, 6)), np.empty((2, 3)), np.empty((2, 8))
-    assert not run_linearize(LENS.model, np.eye(3), np.zeros(3), X, pixel, r, J_pose, J_point, J_model)
-    assert (r == 7.0).all() and np.isinf(run_squared_error(LENS.model, np.eye(3), np.zeros(3), X, pixel))
+    scene = LENS.model[None], True, np.eye(3)[None], np.zeros((1, 3)), np.array([[0.1, 0.2, -1.0]]), np.zeros((1, 2))
+    assert run_linearize(*scene)[0] == 0.0
+    assert np.isinf(run_squared_error(*scene))
 
 
 def orbit(true, num_points, rng):

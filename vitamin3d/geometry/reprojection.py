@@ -38,50 +38,68 @@ def linearize(intrinsics, R, t, X, pixel, r, J_pose, J_point):  # type: ignore[n
 
 
 @inlined
-def linearize_distorted(model, R, t, X, pixel, r, J_pose, J_point, J_model):  # type: ignore[no-untyped-def]
-    """Like `linearize` for a distorted pixel and the camera's `model` fx fy cx cy k1 k2 p1 p2; J_model (2, 8) is by these."""
-    x = R[0, 0] * X[0] + R[0, 1] * X[1] + R[0, 2] * X[2] + t[0]
-    y = R[1, 0] * X[0] + R[1, 1] * X[1] + R[1, 2] * X[2] + t[1]
-    z = R[2, 0] * X[0] + R[2, 1] * X[1] + R[2, 2] * X[2] + t[2]
-    if z < MIN_DEPTH:
-        return False
-    q = 1.0 / z
-    a, b = x * q, y * q
-    fx, fy, k1, k2, p1, p2 = model[0], model[1], model[4], model[5], model[6], model[7]
-    a2, ab, b2 = a * a, a * b, b * b
-    r2 = a2 + b2
-    radial, slope = 1.0 + r2 * (k1 + r2 * k2), 2.0 * k1 + 4.0 * k2 * r2
-    u, v = a * radial + 2.0 * p1 * ab + p2 * (r2 + 2.0 * a2), b * radial + p1 * (r2 + 2.0 * b2) + 2.0 * p2 * ab
-    r[0], r[1] = fx * u + model[2] - pixel[0], fy * v + model[3] - pixel[1]
-    mixed = ab * slope + 2.0 * p1 * a + 2.0 * p2 * b
-    ua, ub, va = fx * (radial + a2 * slope + 2.0 * p1 * b + 6.0 * p2 * a), fx * mixed, fy * mixed
-    vb = fy * (radial + b2 * slope + 6.0 * p1 * b + 2.0 * p2 * a)
-    J_pose[0, 0], J_pose[0, 1], J_pose[0, 2] = q * ua, q * ub, -q * (ua * a + ub * b)
-    J_pose[0, 3], J_pose[0, 4], J_pose[0, 5] = -ua * ab - ub * (1.0 + b2), ua * (1.0 + a2) + ub * ab, ub * a - ua * b
-    J_pose[1, 0], J_pose[1, 1], J_pose[1, 2] = q * va, q * vb, -q * (va * a + vb * b)
-    J_pose[1, 3], J_pose[1, 4], J_pose[1, 5] = -va * ab - vb * (1.0 + b2), va * (1.0 + a2) + vb * ab, vb * a - va * b
-    for m in range(2):
-        for k in range(3):
-            J_point[m, k] = J_pose[m, 0] * R[0, k] + J_pose[m, 1] * R[1, k] + J_pose[m, 2] * R[2, k]
-    J_model[0, 0], J_model[0, 1], J_model[0, 2], J_model[0, 3] = u, 0.0, 1.0, 0.0
-    J_model[1, 0], J_model[1, 1], J_model[1, 2], J_model[1, 3] = 0.0, v, 0.0, 1.0
-    J_model[0, 4], J_model[0, 5], J_model[0, 6], J_model[0, 7] = fx * a * r2, fx * a * r2 * r2, 2.0 * fx * ab, fx * (r2 + 2.0 * a2)
-    J_model[1, 4], J_model[1, 5], J_model[1, 6], J_model[1, 7] = fy * b * r2, fy * b * r2 * r2, fy * (r2 + 2.0 * b2), 2.0 * fy * ab
-    return True
+def in_camera(R, t, c, points, n):  # type: ignore[no-untyped-def]
+    """x, y, z of point n in the frame of camera c.
+
+    The functions below take numbers and return numbers: numba counts references to arrays that it hands to a function
+    with branches, which takes longer than all the arithmetic.
+    """
+    X, Y, Z = points[n, 0], points[n, 1], points[n, 2]
+    x = R[c, 0, 0] * X + R[c, 0, 1] * Y + R[c, 0, 2] * Z + t[c, 0]
+    y = R[c, 1, 0] * X + R[c, 1, 1] * Y + R[c, 1, 2] * Z + t[c, 1]
+    return x, y, R[c, 2, 0] * X + R[c, 2, 1] * Y + R[c, 2, 2] * Z + t[c, 2]
 
 
 @inlined
-def squared_error_distorted(model, R, t, X, pixel):  # type: ignore[no-untyped-def]
-    """|r|² in pixels² of a distorted pixel, infinite behind the camera."""
-    z = R[2, 0] * X[0] + R[2, 1] * X[1] + R[2, 2] * X[2] + t[2]
+def linearize_normalized(x, y, z, is_distorted, fx, fy, cx, cy, k1, k2, p1, p2, u, v):  # type: ignore[no-untyped-def]
+    """The residual and its derivatives in few numbers: q, a, b, r0, r1, p00, p01, p10, p11; q = 0 behind the camera.
+
+    (a, b, 1) / q is the point in the camera frame, r the residual to the pixel (u, v), p the derivative of the pixel by
+    (a, b). So the derivative by the pose is p @ [[q, 0, -q a, -a b, 1 + a², -b], [0, q, -q b, -(1 + b²), a b, a]], and by
+    the point p @ q [[1, 0, -a], [0, 1, -b]] @ R. is_distorted says whether k1 to p2 count.
+    """
+    q = 1.0 / z if z >= MIN_DEPTH else 0.0
+    a, b = x * q, y * q
+    if not is_distorted:
+        return q, a, b, fx * a + cx - u, fy * b + cy - v, fx, 0.0, 0.0, fy
+    xd, yd = distort(a, b, k1, k2, p1, p2)
+    r2 = a * a + b * b
+    radial, slope = 1.0 + r2 * (k1 + r2 * k2), 2.0 * k1 + 4.0 * k2 * r2
+    mixed = a * b * slope + 2.0 * p1 * a + 2.0 * p2 * b
+    xa, yb = radial + a * a * slope + 2.0 * p1 * b + 6.0 * p2 * a, radial + b * b * slope + 6.0 * p1 * b + 2.0 * p2 * a
+    return q, a, b, fx * xd + cx - u, fy * yd + cy - v, fx * xa, fx * mixed, fy * mixed, fy * yb
+
+
+@inlined
+def squared_error_normalized(x, y, z, is_distorted, fx, fy, cx, cy, k1, k2, p1, p2, u, v):  # type: ignore[no-untyped-def]
+    """|r|² of `linearize_normalized` in pixels², infinite behind the camera."""
     if z < MIN_DEPTH:
         return np.inf
     q = 1.0 / z
-    a = q * (R[0, 0] * X[0] + R[0, 1] * X[1] + R[0, 2] * X[2] + t[0])
-    b = q * (R[1, 0] * X[0] + R[1, 1] * X[1] + R[1, 2] * X[2] + t[1])
-    u, v = distort(a, b, model[4], model[5], model[6], model[7])
-    du, dv = model[0] * u + model[2] - pixel[0], model[1] * v + model[3] - pixel[1]
+    a, b = x * q, y * q
+    if is_distorted:
+        a, b = distort(a, b, k1, k2, p1, p2)
+    du, dv = fx * a + cx - u, fy * b + cy - v
     return du * du + dv * dv
+
+
+@inlined
+def model_derivatives(models, m, a, b, J):  # type: ignore[no-untyped-def]
+    """Fills J (2, 8), the derivative of the pixel by fx fy cx cy k1 k2 p1 p2 of model m at normalised coordinates (a, b)."""
+    u, v = distort(a, b, models[m, 4], models[m, 5], models[m, 6], models[m, 7])
+    r2 = a * a + b * b
+    fx, fy = models[m, 0], models[m, 1]
+    J[0, 0], J[0, 1], J[0, 2], J[0, 3] = u, 0.0, 1.0, 0.0
+    J[1, 0], J[1, 1], J[1, 2], J[1, 3] = 0.0, v, 0.0, 1.0
+    J[0, 4], J[0, 5], J[0, 6], J[0, 7] = fx * a * r2, fx * a * r2 * r2, 2.0 * fx * a * b, fx * (r2 + 2.0 * a * a)
+    J[1, 4], J[1, 5], J[1, 6], J[1, 7] = fy * b * r2, fy * b * r2 * r2, fy * (r2 + 2.0 * b * b), 2.0 * fy * a * b
+
+
+@kernel
+def fill_model_derivatives(models, rays, J):  # type: ignore[no-untyped-def]
+    """J (N, 2, 8) by the model (1, 8) of the pixels of rays (N, 3) with z = 1."""
+    for i in range(rays.shape[0]):
+        model_derivatives(models, 0, rays[i, 0], rays[i, 1], J[i])
 
 
 @inlined
@@ -122,20 +140,18 @@ def retract(delta, R, t, R_new, t_new):  # type: ignore[no-untyped-def]
         theta = np.sqrt(theta2)
         a, b = np.sin(theta) / theta, (1.0 - np.cos(theta)) / theta2
         c = (1.0 - a) / theta2
-    e = np.empty((3, 3))
-    e[0, 0], e[0, 1], e[0, 2] = 1.0 - b * (w1 * w1 + w2 * w2), b * w0 * w1 - a * w2, b * w0 * w2 + a * w1
-    e[1, 0], e[1, 1], e[1, 2] = b * w0 * w1 + a * w2, 1.0 - b * (w0 * w0 + w2 * w2), b * w1 * w2 - a * w0
-    e[2, 0], e[2, 1], e[2, 2] = b * w0 * w2 - a * w1, b * w1 * w2 + a * w0, 1.0 - b * (w0 * w0 + w1 * w1)
+    e00, e01, e02 = 1.0 - b * (w1 * w1 + w2 * w2), b * w0 * w1 - a * w2, b * w0 * w2 + a * w1
+    e10, e11, e12 = b * w0 * w1 + a * w2, 1.0 - b * (w0 * w0 + w2 * w2), b * w1 * w2 - a * w0
+    e20, e21, e22 = b * w0 * w2 - a * w1, b * w1 * w2 + a * w0, 1.0 - b * (w0 * w0 + w1 * w1)
     d0, d1, d2 = delta[0], delta[1], delta[2]
     u0, u1, u2 = w1 * d2 - w2 * d1, w2 * d0 - w0 * d2, w0 * d1 - w1 * d0
     dot = w0 * d0 + w1 * d1 + w2 * d2
-    v0 = d0 + b * u0 + c * (w0 * dot - theta2 * d0)
-    v1 = d1 + b * u1 + c * (w1 * dot - theta2 * d1)
-    v2 = d2 + b * u2 + c * (w2 * dot - theta2 * d2)
-    for i in range(3):
-        for j in range(3):
-            R_new[i, j] = e[i, 0] * R[0, j] + e[i, 1] * R[1, j] + e[i, 2] * R[2, j]
+    for j in range(3):
+        x, y, z = R[0, j], R[1, j], R[2, j]
+        R_new[0, j] = e00 * x + e01 * y + e02 * z
+        R_new[1, j] = e10 * x + e11 * y + e12 * z
+        R_new[2, j] = e20 * x + e21 * y + e22 * z
     x, y, z = t[0], t[1], t[2]
-    t_new[0] = e[0, 0] * x + e[0, 1] * y + e[0, 2] * z + v0
-    t_new[1] = e[1, 0] * x + e[1, 1] * y + e[1, 2] * z + v1
-    t_new[2] = e[2, 0] * x + e[2, 1] * y + e[2, 2] * z + v2
+    t_new[0] = e00 * x + e01 * y + e02 * z + d0 + b * u0 + c * (w0 * dot - theta2 * d0)
+    t_new[1] = e10 * x + e11 * y + e12 * z + d1 + b * u1 + c * (w1 * dot - theta2 * d1)
+    t_new[2] = e20 * x + e21 * y + e22 * z + d2 + b * u2 + c * (w2 * dot - theta2 * d2)
