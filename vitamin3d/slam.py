@@ -8,7 +8,11 @@ from dataclasses import replace
 
 import numpy as np
 
+from vitamin3d.bundle_adjustment.adjust import adjust_bundle
 from vitamin3d.bundle_adjustment.problem import BundleProblem
+from vitamin3d.bundle_adjustment.schur import adjust_schur
+from vitamin3d.bundle_adjustment.subspace import adjust_subspace
+from vitamin3d.bundle_adjustment.variables import squared_reprojection_errors
 from vitamin3d.config import Config
 from vitamin3d.geometry.camera import Camera
 from vitamin3d.geometry.se3 import inverse
@@ -23,7 +27,6 @@ from vitamin3d.mapping.p3p_localization import localize
 from vitamin3d.mapping.pose_log import PoseLog
 from vitamin3d.mapping.relocalization import relocalize
 from vitamin3d.mapping.sparse_map import SparseMap
-from vitamin3d.mapping.subspace_bundle_adjustment import adjust_bundle, adjust_schur, adjust_subspace, squared_reprojection_errors
 from vitamin3d.mapping.two_view_initialization import initialize_from_two_views
 from vitamin3d.mapping.window_selection import Window, build_problem, select_frame_window, select_window, store_solution, whole_map
 from vitamin3d.tracking.extrema import refine_extrema, select_free_extrema

@@ -135,7 +135,9 @@ def sweep_cameras(views, by_camera, points, inverse_squared_sigma, scratch):  # 
             retract(delta, R[c], t[c], R_new[0], t_new[0])
             after = 0.0
             for i in range(first, last):
-                after += _rho(observation_error(R_new, t_new, 0, models, m, distorted, points, obs_point[i], pixels, i), inverse_squared_sigma)
+                after += _rho(
+                    observation_error(R_new, t_new, 0, models, m, distorted, points, obs_point[i], pixels, i), inverse_squared_sigma
+                )
             if after <= before:
                 R[c], t[c] = R_new[0], t_new[0]
                 size = 0.0

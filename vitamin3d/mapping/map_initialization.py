@@ -5,6 +5,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from vitamin3d.bundle_adjustment.schur import adjust_schur
+from vitamin3d.bundle_adjustment.variables import squared_reprojection_errors
 from vitamin3d.config import Config
 from vitamin3d.geometry.camera import Camera
 from vitamin3d.mapping.initialization_history import TrackedView, shared_tracks
@@ -12,7 +14,6 @@ from vitamin3d.mapping.landmark_recovery import cut_patches
 from vitamin3d.mapping.landmark_triangulation import triangulate_landmarks
 from vitamin3d.mapping.p3p_localization import localize
 from vitamin3d.mapping.sparse_map import SparseMap
-from vitamin3d.mapping.subspace_bundle_adjustment import adjust_schur, squared_reprojection_errors
 from vitamin3d.mapping.two_view_initialization import median_motion
 from vitamin3d.mapping.window_selection import build_problem, store_solution, whole_map
 from vitamin3d.types import Array, Frame, TwoView
