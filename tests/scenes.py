@@ -57,6 +57,22 @@ def arc_scene(num_cameras, num_points, rng, camera=PINHOLE):
     return Scene(camera, poses, points, obs_camera, obs_point, pixels)
 
 
+def orbit(camera, num_points, rng):
+    """Twelve cameras around a box of points, two rounds of 180° at other heights, rolled: calibration is well determined."""
+    points, poses, obs = rng.uniform(-1.5, 1.5, (num_points, 3)), [], []
+    for k in range(12):
+        turn = exp_se3(np.array([0, 0, 0, 0, 0.5 * (k % 6) + 0.1 * k, 0])) @ exp_se3(
+            np.array([0, 0, 0, 0.4 * (k // 6) - 0.2, 0, 0.5 * (k % 4)])
+        )
+        turn[:3, 3] = -turn[:3, 2] * (4.5 + 0.4 * (k % 3))
+        poses.append(np.linalg.inv(turn))
+        pixels = camera.distort(project(camera, poses[k], points))
+        obs += [(k, p) for p in np.flatnonzero(camera.is_inside(pixels))]
+    obs_camera, obs_point = (np.array(column, np.int32) for column in zip(*obs, strict=True))
+    pixels = np.array([project(camera, poses[c], points[p : p + 1])[0] for c, p in obs])
+    return Scene(camera, np.array(poses), points, obs_camera, obs_point, pixels)
+
+
 def with_noise(scene, rng, sigma_px=0.5, outlier_share=0.03):
     """The scene with noisy pixels, some of them far off; and which are (M,) outliers."""
     pixels = scene.pixels + sigma_px * rng.standard_normal(scene.pixels.shape)

@@ -24,7 +24,7 @@ from vitamin3d.geometry.se3 import inverse
 from vitamin3d.geometry.sim3_alignment import align_sim3
 
 SIGMA = 2.0
-ITERATIONS = {"schur": 30, "subspace": 300}
+ITERATIONS = {"schur": 30, "subspace-accelerated": 30, "subspace": 300}
 
 
 @pytest.fixture(scope="module")
@@ -85,7 +85,7 @@ def test_the_reported_cost_is_the_minimised_cost(solved, start):
     assert 0.4 < report.rmse_px < 0.9  # 0.5 px in each coordinate, less what the points take up
 
 
-@pytest.mark.parametrize(("name", "limit"), [("schur", 0.02), ("subspace", 0.05)])
+@pytest.mark.parametrize(("name", "limit"), [("schur", 0.02), ("subspace-accelerated", 0.02), ("subspace", 0.05)])
 def test_the_truth_is_found(name, limit, scene, start):
     problem, _ = SOLVERS[name](start, PINHOLE, SIGMA, ITERATIONS[name], 1e-5)
     s, R, t = align_sim3(problem.points_world, scene.points)

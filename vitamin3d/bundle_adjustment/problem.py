@@ -64,6 +64,27 @@ class BundleProblem:
     obs_rows: Array
     """(M,) int64, index of the observation in the map; -1: of the frame that is no keyframe."""
 
+    def renewed(self, made: "BundleProblem") -> "BundleProblem":
+        """A problem `made` of this one's arrays, with this one's `landmark_ids` and `obs_rows`."""
+        return dataclasses.replace(made, landmark_ids=self.landmark_ids, obs_rows=self.obs_rows[made.obs_rows])
+
+
+def make_problem(
+    T_cam_world: Array, points_world: Array, obs_camera: Array, obs_point: Array, obs_pixels: Array, camera_is_free: Array | None = None
+) -> BundleProblem:
+    """A problem from arrays in any order; all cameras but the first are free where camera_is_free (C,) does not say.
+
+    `landmark_ids` and `obs_rows` number the points and observations as they are given.
+    """
+    C, P = len(T_cam_world), len(points_world)
+    is_free = np.arange(C) > 0 if camera_is_free is None else np.asarray(camera_is_free, np.bool_)
+    rows = np.argsort(obs_camera, kind="stable")
+    camera, point = np.asarray(obs_camera, np.int32)[rows], np.asarray(obs_point, np.int32)[rows]
+    starts, order = np.empty(P + 1, np.int64), np.empty(len(rows), np.int64)
+    order_by_point(point, P, starts, order)
+    poses, points, pixels = (np.array(a, np.float64) for a in (T_cam_world, points_world, np.asarray(obs_pixels)[rows]))
+    return BundleProblem(poses, is_free, points, camera, point, pixels, starts, order, np.arange(P), rows)
+
 
 def select_points(problem: BundleProblem, keep: Array) -> BundleProblem:
     """The problem with the points of a mask (P,) bool and their observations; all cameras."""

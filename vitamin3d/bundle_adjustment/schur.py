@@ -6,6 +6,7 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.linalg import lapack
 
+from vitamin3d.bundle_adjustment.marginalization import CameraPrior
 from vitamin3d.bundle_adjustment.normal_equations import (
     NormalEquations,
     Sightings,
@@ -16,6 +17,7 @@ from vitamin3d.bundle_adjustment.normal_equations import (
     squared_errors,
 )
 from vitamin3d.bundle_adjustment.problem import BundleProblem
+from vitamin3d.bundle_adjustment.subspace import new_scratch, sweep_points
 from vitamin3d.bundle_adjustment.variables import Progress, Variables, free_slots, pinhole_model, sightings_of
 from vitamin3d.geometry.camera import Camera
 from vitamin3d.types import Array, BundleReport
@@ -62,6 +64,7 @@ class ReducedSystem:
         self.num_shared, self.width = 0 if own else K, 6 + K if own else 6
         self.prior = np.zeros(self.num_shared) if prior is None else prior
         self.from_start = np.zeros(self.num_shared)
+        self.camera_prior: CameraPrior | None = None
         self.equations = NormalEquations.zeros(num_free, self.width, self.num_shared, len(sightings.starts) - 1)
 
     def build(self, variables: Variables, damping: float, most_bend: float) -> tuple[float, Array]:
@@ -80,7 +83,9 @@ class ReducedSystem:
         if K:
             e.reduced[rows[:, :6, None], border + np.arange(K)] += e.H_border
             e.reduced[border:, border:] += e.H_shared
-        return cost + float(self.prior @ self.from_start**2), e.gradient
+        if self.camera_prior is not None:
+            self.camera_prior.add_to(variables.R, variables.t, self.slot, damping, e.reduced, e.gradient)
+        return cost + self.prior_cost(variables, np.zeros(K)), e.gradient
 
     def step(self, variables: Variables, damping: float, most_bend: float = 0.0) -> Step:
         """The step from `variables`, not yet taken."""
@@ -98,11 +103,16 @@ class ReducedSystem:
             variables.views(self.slot), moved.views(self.slot), self.sightings, variables.points, delta,
             self.inverse_squared_sigma, most_bend, e, moved.points,
         )  # fmt: skip
-        cost += float(self.prior @ (self.from_start + shared) ** 2)
+        cost += self.prior_cost(moved, shared)
         cost = cost if np.isfinite(cost) and (moved.models[:, :2] > 0).all() else np.inf
         largest_pose = float(np.sqrt((delta[:, :6] ** 2).sum(axis=1)).max(initial=0.0))
         largest_point = float(np.sqrt(((moved.points - variables.points) ** 2).sum(axis=1)).max(initial=0.0))
         return Step(moved, cost_before, cost, norm, largest_pose, largest_point, shared, information, alone)
+
+    def prior_cost(self, variables: Variables, shared: Array) -> float:
+        """What the priors add to the cost at `variables`, the shared parameters a step of `shared` (K,) from here."""
+        cost = float(self.prior @ (self.from_start + shared) ** 2)
+        return cost if self.camera_prior is None else cost + self.camera_prior.cost(variables.R, variables.t)
 
     def _moved(self, variables: Variables, delta: Array, shared: Array) -> Variables:
         models = variables.models
@@ -153,6 +163,16 @@ def _solve_weak(M: Array, rest: Array) -> Array:
     return np.asarray(vectors @ np.where(values > LEAST_INFORMATION, along / np.maximum(values, LEAST_INFORMATION), 0.0))
 
 
+def adjust_accelerated(
+    problem: BundleProblem, camera: Camera, sigma_px: float, iterations: int, relative_gain: float = 1e-5
+) -> tuple[BundleProblem, BundleReport]:
+    """Like `adjust_schur`, with a sweep of the subspace method over the points (Eq. 12) in each step.
+
+    All cameras move together and then each point alone, by its own non-linear equations: fewer steps, each a fifth longer.
+    """
+    return _adjust(problem, camera, sigma_px, iterations, relative_gain, 1)
+
+
 def adjust_schur(
     problem: BundleProblem, camera: Camera, sigma_px: float, iterations: int, relative_gain: float = 1e-5
 ) -> tuple[BundleProblem, BundleReport]:
@@ -162,22 +182,36 @@ def adjust_schur(
         The solved problem, and a report with the cost after each accepted or refused step; it ends when a step gains less than
         relative_gain.
     """
+    return _adjust(problem, camera, sigma_px, iterations, relative_gain, 0)
+
+
+def _adjust(
+    problem: BundleProblem, camera: Camera, sigma_px: float, iterations: int, relative_gain: float, point_sweeps: int
+) -> tuple[BundleProblem, BundleReport]:
     system = ReducedSystem(sightings_of(problem), free_slots(problem), sigma_px)
-    variables, progress = minimise(system, Variables.of(problem, pinhole_model(camera)), iterations, relative_gain)
+    variables, progress = minimise(system, Variables.of(problem, pinhole_model(camera)), iterations, relative_gain, point_sweeps)
     return variables.written_to(problem), progress.report(system.squared_errors(variables), sigma_px)
 
 
-def minimise(system: ReducedSystem, variables: Variables, iterations: int, relative_gain: float) -> tuple[Variables, Progress]:
-    """Damped steps until one of them gains less than a share of the cost."""
-    progress, damping = Progress(), FIRST_DAMPING
+def minimise(
+    system: ReducedSystem, variables: Variables, iterations: int, relative_gain: float, point_sweeps: int = 0
+) -> tuple[Variables, Progress]:
+    """Damped steps until one of them gains less than a share of the cost; after each the points alone are swept, if asked for."""
+    progress, damping, scratch = Progress(), FIRST_DAMPING, new_scratch()
     for _ in range(iterations):
         step = system.step(variables, damping)
+        cost = step.cost
+        for _ in range(point_sweeps if np.isfinite(cost) else 0):
+            views = step.moved.views(system.slot)
+            *_, cost = sweep_points(views, system.sightings, step.moved.points, system.inverse_squared_sigma, scratch)
+            cost += system.prior_cost(step.moved, step.shared)
         if not progress.costs:
             progress.costs.append(step.cost_before)
-        accepted = step.cost <= progress.costs[-1]
-        progress.costs.append(min(step.cost, progress.costs[-1]))
+        accepted = cost <= progress.costs[-1]
+        progress.costs.append(min(cost, progress.costs[-1]))
         progress.steps.append((step.gradient_norm, step.largest_pose, step.largest_point))
         if accepted:
+            system.from_start = system.from_start + step.shared
             variables, damping = step.moved, max(MIN_DAMPING, 0.1 * damping)
             if progress.costs[-2] - progress.costs[-1] <= relative_gain * progress.costs[-1]:
                 progress.stopped = "gain"

@@ -78,7 +78,7 @@ def adjust_with_intrinsics(
     Raises:
         InputError: an unknown, doubled or contradictory name.
     """
-    basis, sightings = calibration_basis(camera, free), sightings_of(problem, camera.distort(problem.obs_pixels))
+    basis, sightings = parameter_basis(free, camera.fy / camera.fx), sightings_of(problem, camera.distort(problem.obs_pixels))
     variables = Variables.of(problem, camera.model[None])
     noise_px = _noise(ReducedSystem(sightings, free_slots(problem), sigma_px).squared_errors(variables), problem, len(free), sigma_px)
     prior = np.array([(noise_px / priors[name]) ** 2 if priors and name in priors else 0.0 for name in free])
@@ -121,8 +121,8 @@ def _minimise(
     return variables, progress
 
 
-def calibration_basis(camera: Camera, free: Sequence[str]) -> Array:
-    """(8, K): how fx fy cx cy k1 k2 p1 p2 move with the free parameters.
+def parameter_basis(free: Sequence[str], aspect: float) -> Array:
+    """(8, K): how fx fy cx cy k1 k2 p1 p2 move with the free parameters; `f` moves fy by `aspect` times what it moves fx.
 
     Raises:
         InputError: an unknown, doubled or contradictory name.
@@ -135,7 +135,7 @@ def calibration_basis(camera: Camera, free: Sequence[str]) -> Array:
     basis = np.zeros((8, len(free)))
     for k, name in enumerate(free):
         if name == "f":
-            basis[:2, k] = 1.0, camera.fy / camera.fx
+            basis[:2, k] = 1.0, aspect
         else:
             basis[PARAMETERS.index(name) - 1, k] = 1.0
     return basis

@@ -12,8 +12,6 @@ import numpy as np
 
 from vitamin3d._jit import inlined, kernel
 from vitamin3d.bundle_adjustment.normal_equations import (
-    Sightings,
-    Views,
     add_camera,
     information,
     inverse_root,
@@ -240,8 +238,16 @@ def adjust_subspace(
     Returns:
         The solved problem, and a report with the cost after each sweep; it ends when a sweep gains less than relative_gain.
     """
+    variables = Variables.of(problem, pinhole_model(camera))
+    progress = sweep_until(problem, variables, 1.0 / sigma_px**2, sweeps, relative_gain)
+    out = np.empty(len(problem.obs_camera))
+    squared_errors(variables.views(free_slots(problem)), sightings_of(problem), variables.points, out)
+    return variables.written_to(problem), progress.report(out, sigma_px)
+
+
+def sweep_until(problem: BundleProblem, variables: Variables, weight: float, sweeps: int, relative_gain: float) -> Progress:
+    """Sweeps over cameras and points, `variables` changed in place, until one gains less than a share of the cost; weight = 1 / sigma²."""
     sightings, by_camera, scratch = sightings_of(problem), by_camera_of(problem), new_scratch()
-    variables, weight = Variables.of(problem, pinhole_model(camera)), 1.0 / sigma_px**2
     views, progress = variables.views(free_slots(problem)), Progress()
     progress.costs.append(total_cost(views, sightings, variables.points, weight))
     for _ in range(sweeps):
@@ -252,10 +258,4 @@ def adjust_subspace(
         if progress.costs[-2] - progress.costs[-1] <= relative_gain * progress.costs[-2]:
             progress.stopped = "gain"
             break
-    return variables.written_to(problem), progress.report(_errors(views, sightings, variables.points), sigma_px)
-
-
-def _errors(views: Views, sightings: Sightings, points: Array) -> Array:
-    out = np.empty(len(sightings.camera))
-    squared_errors(views, sightings, points, out)
-    return out
+    return progress

@@ -57,14 +57,19 @@ def pinhole_model(camera: Camera) -> Array:
     return np.array([[camera.fx, camera.fy, camera.cx, camera.cy, 0.0, 0.0, 0.0, 0.0]])
 
 
-def squared_reprojection_errors(problem: BundleProblem, camera: Camera) -> Array:
-    """|r|² (M,) of all observations in pixels², inf behind the camera."""
+def squared_errors_of(problem: BundleProblem, models: Array) -> Array:
+    """|r|² (M,) of all observations in pixels², inf behind the camera; models (1, 8) or (C, 8)."""
     sightings, out = sightings_of(problem), np.empty(len(problem.obs_camera))
-    variables = Variables.of(problem, pinhole_model(camera))
+    variables = Variables.of(problem, models)
     squared_errors(variables.views(free_slots(problem)), sightings, variables.points, out)
     by_row = np.empty_like(out)
     by_row[problem.point_order] = out
     return by_row
+
+
+def squared_reprojection_errors(problem: BundleProblem, camera: Camera) -> Array:
+    """|r|² (M,) of all observations, ideal pixels of `camera`, in pixels²; inf behind the camera."""
+    return squared_errors_of(problem, pinhole_model(camera))
 
 
 @dataclass
