@@ -33,7 +33,7 @@ $(VENV)/.installed: pyproject.toml $(PINS) | $(VENV)/bin/python
 
 $(VENV)/.installed-dev: pyproject.toml $(PINS) | $(VENV)/bin/python
 	@tools/system_libraries.sh
-	$(VENV)/bin/python -m pip install --quiet --disable-pip-version-check --constraint $(PINS) --editable '.[dev,eval]'
+	$(VENV)/bin/python -m pip install --quiet --disable-pip-version-check --constraint $(PINS) --editable '.[dev,eval,cluster]'
 	@touch $@ $(VENV)/.installed
 
 clean:

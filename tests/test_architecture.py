@@ -26,7 +26,7 @@ FORBIDDEN = {
     "evaluation": ("tracking", "mapping", "dense"),
 }
 """Unit -> what it must not import from `vitamin3d.`; the empty name: nothing of ours at all."""
-ABOVE = ("slam", "reconstruction", "runtime", "job", "run_statistics", "run_report", "progress", "commands", "cli")
+ABOVE = ("slam", "reconstruction", "runtime", "job", "run_statistics", "run_report", "benchmark", "progress", "commands", "cli")
 LAZY = ("open3d", "pymeshlab")
 MAX_LINES = 60
 

@@ -5,6 +5,7 @@ import sys
 
 import typer
 
+from vitamin3d.commands.benchmark import benchmark
 from vitamin3d.commands.compare import compare
 from vitamin3d.commands.evaluate import evaluate
 from vitamin3d.commands.process import EXIT_ERROR
@@ -22,6 +23,7 @@ def _vitamin3d() -> None:
 app.command()(reconstruct)
 app.command()(evaluate)
 app.command()(compare)
+app.command()(benchmark)
 app.command("config")(show_config)
 
 

@@ -17,6 +17,8 @@ DATASETS = {
     "euroc": "vitamin3d.datasets.euroc:EurocDataset",
     "tum": "vitamin3d.datasets.tum:TumDataset",
     "kitti": "vitamin3d.datasets.kitti:KittiDataset",
+    "7scenes": "vitamin3d.datasets.seven_scenes:SevenScenesDataset",
+    "icl": "vitamin3d.datasets.icl_nuim:IclNuimDataset",
     "images": "vitamin3d.datasets.image_folder:ImageFolderDataset",
     "video": "vitamin3d.datasets.video:VideoDataset",
 }
@@ -27,7 +29,7 @@ def open_dataset(source: Path, calibration: Path | None = None) -> Dataset:
     """Opens a sequence.
 
     Args:
-        source: a EuRoC, TUM or KITTI folder, a folder of pictures, or a video.
+        source: a EuRoC, TUM, KITTI, 7-Scenes or ICL-NUIM folder, a folder of pictures, or a video.
         calibration: a file with the fields of EuRoC's `sensor.yaml`; overrides the source's own.
 
     Raises:
@@ -51,6 +53,10 @@ def _kind_of_folder(source: Path) -> str:
         return "tum"
     if (source / "times.txt").is_file() and any((source / name).is_dir() for name in ("image_0", "image_2")):
         return "kitti"
+    if next(source.glob("frame-*.color.*"), None) is not None:
+        return "7scenes"
+    if (source / "associations.txt").is_file() and (source / "rgb").is_dir():
+        return "icl"
     return "images"
 
 

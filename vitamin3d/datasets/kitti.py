@@ -28,8 +28,11 @@ class KittiDataset(PictureSequence):
 
     def ground_truth(self) -> Trajectory | None:
         """Camera-to-world poses in metres, of the left grey camera."""
-        poses = self._source / "poses.txt"
-        return read_kitti_poses(poses, self.timestamps_ns.tolist()) if poses.is_file() else tum_truth(self._source)
+        folder = self._source.resolve()
+        for poses in (folder / "poses.txt", folder.parents[1] / "poses" / f"{folder.name}.txt"):
+            if poses.is_file():
+                return read_kitti_poses(poses, self.timestamps_ns.tolist())
+        return tum_truth(self._source)
 
 
 def _camera(folder: Path, listing: Listing, calibration: Path | None) -> Camera:
