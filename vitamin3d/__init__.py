@@ -10,6 +10,9 @@ from typing import TYPE_CHECKING, Any
 if TYPE_CHECKING:
     from vitamin3d.config import Config, load_toml, paper_config
     from vitamin3d.datasets import Unreadable, open_dataset
+    from vitamin3d.evaluation.comparison import compare, read_other, read_own
+    from vitamin3d.evaluation.finished_run import TruthRequest, read_run, read_truth
+    from vitamin3d.evaluation.run_evaluation import evaluate
     from vitamin3d.exporters.output_folder import OutputFolder
     from vitamin3d.geometry.camera import Camera
     from vitamin3d.job import Job, Selection, reconstruct_sequence
@@ -24,6 +27,9 @@ if TYPE_CHECKING:
 _HOMES = {
     "config": ("Config", "load_toml", "paper_config"),
     "datasets": ("Unreadable", "open_dataset"),
+    "evaluation.comparison": ("compare", "read_other", "read_own"),
+    "evaluation.finished_run": ("TruthRequest", "read_run", "read_truth"),
+    "evaluation.run_evaluation": ("evaluate",),
     "exporters.output_folder": ("OutputFolder",),
     "geometry.camera": ("Camera",),
     "mapping.landmark_statistics": ("point_cloud",),
@@ -52,11 +58,18 @@ __all__ = [
     "SlamState",
     "Surface",
     "Trajectory",
+    "TruthRequest",
     "Unreadable",
+    "compare",
+    "evaluate",
     "load_toml",
     "open_dataset",
     "paper_config",
     "point_cloud",
+    "read_other",
+    "read_own",
+    "read_run",
+    "read_truth",
     "reconstruct_sequence",
     "run_sequential",
     "run_threaded",

@@ -35,7 +35,7 @@ def benchmark(
     peers: Annotated[Path | None, typer.Option(help="Folder with SYSTEM/SEQUENCE/trajectory.tum of others, scored beside ours.")] = None,
     keep_all: Annotated[bool, typer.Option("--keep-all", help="Keep depth maps, normal maps and meshes of all trials.")] = False,
 ) -> None:
-    """Run a benchmark: Tables 1 to 3 and Fig. 4 of the paper. Stopped and started again, it goes on where it was."""
+    """Run all sequences of a data set and print the paper's tables. Started again, it goes on where it was stopped."""
     one_thread_each()
     from vitamin3d.benchmark.run import Plan, run_benchmark
 
