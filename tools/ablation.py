@@ -34,12 +34,10 @@ from vitamin3d.types import Trajectory
 INGREDIENTS: tuple[tuple[str, str, Any], ...] = (
     ("dense flow prediction", "extrema_tracking.prediction", "dominant_flow"),
     ("dense flow prediction", "extrema_tracking.gate_px", 8.0),
-    ("dense flow prediction", "extrema_tracking.gate_medians", 100.0),
     ("coasting", "extrema_tracking.coast_frames", 0),
+    ("weak extrema", "extrema.min_curvature", 0.3),
     ("smoothing", "curvature.smoothing_sigma_px", 0.0),
     ("gate", "extrema_tracking.gate_px", 8.0),
-    ("gate", "extrema_tracking.gate_medians", 100.0),
-    ("gate that follows the frame", "extrema_tracking.gate_medians", 100.0),
     ("reprojection gate that follows the frame", "localization.outlier_medians", 100.0),
     ("recovery", "recovery.enabled", False),
     ("relocalization", "relocalization.enabled", False),
@@ -48,6 +46,7 @@ INGREDIENTS: tuple[tuple[str, str, Any], ...] = (
     ("Schur complement", "bundle_adjustment.keyframe_solver", "subspace"),
     ("motion prior before RANSAC", "localization.prior_inlier_ratio", 2.0),
     ("more than 2000 tracks", "extrema.max_tracks", 2000),
+    ("refined calibration", "calibration.refine", "off"),
     ("final adjustment", "final_adjustment.enabled", False),
 )
 """Ingredient, setting, its value without the ingredient; lines of one name belong together. A new ingredient is a line."""

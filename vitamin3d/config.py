@@ -45,9 +45,9 @@ class CurvatureConfig:
 class ExtremaConfig:
     """Sec. 2.1: which maxima of the curvature become tracks."""
 
-    min_curvature: float = 0.3
+    min_curvature: float = 0.15
     """Noise floor of kappa, grey levels³ per pixel⁴ of the smoothed 0–255 image."""
-    max_tracks: int = 5000
+    max_tracks: int = 5300
     refill_interval: int = 1
     """Frames between two refills with free extrema."""
     min_distance_px: float = 4.0
@@ -81,12 +81,9 @@ class ExtremaTrackingConfig:
     prediction_sigma_px: float = 3.0
     """sigma of w in Eq. 5."""
     max_steps: int = 10
-    gate_px: float = 1.5
-    """A climb that ends farther from the prediction is a miss; and one that ends farther than gate_medians times the
-    frame's median, but not below min_gate_px: where the flow is exact, a far extremum is another one."""
-    gate_medians: float = 2.5
-    min_gate_px: float = 1.0
-    coast_frames: int = 1
+    gate_px: float = 1.1
+    """A climb that ends farther from the prediction is a miss: where the flow is exact, a far extremum is another one."""
+    coast_frames: int = 2
     """Frames in a row that a track may live on its prediction."""
 
 
@@ -246,6 +243,8 @@ class CalibrationConfig:
     """True deviations over those of independent errors: rolling shutter, tracks cut short, the model of the lens."""
     max_focal_deviation: float = 0.01
     """Relative, systematic errors included; above it the motion does not determine the focal length."""
+    significance: float = 3.0
+    """Deviations by which the parameters together must differ from the given ones before `auto` believes that those are wrong."""
     max_change: float = 0.25
     """Of the focal length from the given one, relative."""
 
@@ -368,7 +367,7 @@ def paper_config() -> Config:
     return Config(
         mode="paper",
         curvature=CurvatureConfig(smoothing_sigma_px=2.5),
-        extrema_tracking=ExtremaTrackingConfig(prediction="dominant_flow", gate_px=8.0, gate_medians=100.0, coast_frames=0),
+        extrema_tracking=ExtremaTrackingConfig(prediction="dominant_flow", gate_px=8.0, coast_frames=0),
         localization=LocalizationConfig(prior_inlier_ratio=2.0, outlier_medians=100.0),
         recovery=RecoveryConfig(enabled=False),
         relocalization=RelocalizationConfig(enabled=False),

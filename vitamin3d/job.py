@@ -80,6 +80,7 @@ def reconstruct_sequence(dataset: Dataset, job: Job, output: OutputFolder, obser
     """
     watch, indices = Stopwatch(), job.selection.indices(len(dataset))
     _check_scale_source(dataset, job)
+    job = _with_steady_camera(job)
     front_end, slam = FrontEnd(job.config), Slam(dataset.camera, job.config)
     scale = Scale(job.metric_scale, "given") if job.metric_scale else Scale()
     dense = _Dense(dataset, job, output, scale)
@@ -115,6 +116,17 @@ def _check_scale_source(dataset: Dataset, job: Job) -> None:
         raise InputError("--scale-from-ground-truth needs the whole trajectory before anything is fused; leave --live out")
 
 
+def _with_steady_camera(job: Job) -> Job:
+    """The job as it is, or without refined calibration where depth is fused before the calibration is final."""
+    calibration = job.config.calibration
+    if not job.live or calibration.refine == "off":
+        return job
+    if calibration.refine == "on":
+        raise InputError("--refine-calibration on and --live exclude each other: cameras that differ would be fused; leave one out")
+    config = dataclasses.replace(job.config, calibration=dataclasses.replace(calibration, refine="off"))
+    return dataclasses.replace(job, config=config)
+
+
 def _line(skipped: Unreadable) -> str:
     return f"{skipped.path.name}: {skipped.reason}"
 
@@ -131,6 +143,7 @@ def _write_sparse(slam: Slam, scale: Scale, output: OutputFolder, job: Job) -> i
         f"reprojection RMS up to {config.max_reprojection_rms_px} px"
     )
     output.write_trajectories(slam.trajectory(), slam.keyframe_trajectory(), scale)
+    output.write_calibration(slam.camera, "as given" if slam.camera == slam.calibration.given else "refined with the map")
     output.write_cloud(cloud, scale, remark)
     return len(cloud.points_world)
 

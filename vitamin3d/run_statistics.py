@@ -9,6 +9,8 @@ from typing import Any
 
 import numpy as np
 
+from vitamin3d.geometry.camera import Camera
+from vitamin3d.mapping.calibration_refinement import CalibrationRefinement
 from vitamin3d.runtime import RunRecord, median_of
 from vitamin3d.scale import Scale
 from vitamin3d.slam import Slam
@@ -52,6 +54,25 @@ def versions() -> dict[str, str]:
     return found
 
 
+def calibration_table(camera: Camera, refinement: CalibrationRefinement) -> dict[str, Any]:
+    """The camera that was given and the one that was used; each refinement with its standard deviations or why it was refused."""
+    return {
+        "refine": refinement.config.refine,
+        "refined": camera != refinement.given,
+        "given": _camera_table(refinement.given),
+        "used": _camera_table(camera),
+        "refinements": [
+            {"keyframes": r.num_keyframes, "accepted": r.accepted, "reason": r.reason, "deviations": r.deviations}
+            | _camera_table(r.camera)
+            for r in refinement.history
+        ],
+    }
+
+
+def _camera_table(camera: Camera) -> dict[str, float]:
+    return dict(zip(("fx", "fy", "cx", "cy", "k1", "k2", "p1", "p2"), camera.model.tolist(), strict=True))
+
+
 def run_statistics(
     slam: Slam, record: RunRecord, scale: Scale, cloud_points: int, times: list[StepTimes], watch: Stopwatch
 ) -> dict[str, Any]:
@@ -71,6 +92,7 @@ def run_statistics(
         "landmarks": int(np.isfinite(slam.map.points_world[:, 0]).sum()),
         "cloud_points": cloud_points,
         "median_live_tracks": median_of(record.live_tracks),
+        "calibration": calibration_table(slam.camera, slam.calibration),
         "scale": {"known": scale.is_known, "metres_per_map_unit": metres, "source": scale.source},
         "unit": scale.unit if scale.is_known else "map unit (up to scale)",
         "steps": step_table(*times),

@@ -71,7 +71,7 @@ def test_surface_lies_on_the_true_one(demo_run: Path) -> None:
 def test_every_promised_file_is_there(demo_run: Path) -> None:
     names = {p.name for p in demo_run.iterdir()}
     expected = {"trajectory.tum", "keyframes.tum", "cloud.ply", "mesh_low.ply", "mesh_high.ply", "mesh_high.obj"}
-    assert names == expected | {"config.toml", "stats.json", "tracks.npz", "report.html", "normals", "depth"}
+    assert names == expected | {"calibration.yaml", "config.toml", "stats.json", "tracks.npz", "report.html", "normals", "depth"}
     assert load_toml(demo_run / "config.toml") == Config()
     stamps = [line.split()[0] for line in (demo_run / "keyframes.tum").read_text().splitlines() if not line.startswith("#")]
     maps = {p.stem for p in (demo_run / "normals").glob("*.png")}
@@ -94,7 +94,11 @@ def test_statistics_tell_what_happened(demo_run: Path) -> None:
     assert stats["frames"] == 150 and stats["unreadable_frames"] == 0 and not stats["interrupted"]
     assert stats["success_rate"] == pytest.approx(stats["tracked_frames"] / 150, abs=1e-6)
     assert stats["tracked_frames"] >= 148 and stats["keyframes"] > 10 and stats["cloud_points"] > 2000
-    assert 1500 < stats["median_live_tracks"] <= 5000
+    assert 1500 < stats["median_live_tracks"] <= 5300
+    calibration = stats["calibration"]
+    assert not calibration["refined"] and calibration["used"] == calibration["given"] and len(calibration["refinements"]) >= 1
+    given = open_dataset(DEMO).camera
+    assert read_calibration(demo_run / "calibration.yaml").camera == given
     assert stats["unit"] == "metre" and stats["voxels"]["high"] == pytest.approx(0.025)
     assert {"curvature_extrema", "track_extrema", "localize", "bundle_adjustment_frame", "denoising", "fusion_high"} <= set(stats["steps"])
     assert stats["wall_seconds"] > 0 and stats["cpu_seconds"] > 0 and stats["peak_memory_mb"] > 100

@@ -424,3 +424,9 @@ def test_ctrl_c_before_there_is_a_map(vitamin3d, out, monkeypatch):
     result = vitamin3d("reconstruct", DEMO, "-o", out)
     assert result.code == 130 and len(result.errors) == 1 and result.errors[0].startswith("no map: ")
     assert json.loads((out / "stats.json").read_text())["interrupted"]
+
+
+def test_depth_fused_while_the_calibration_changes_is_refused(vitamin3d, out):
+    result = vitamin3d("reconstruct", DEMO, "-o", out, "--live", "--refine-calibration", "on")
+    assert result.code == 2 and len(result.errors) == 1
+    assert "--refine-calibration on and --live exclude each other" in result.errors[0]

@@ -47,7 +47,7 @@ def test_a_file_changes_only_what_it_names(tmp_path):
         ("seed = true", "seed must be like 0"),
         ("seed = '1'", "seed must be like 0"),
         ("[recovery]\nenabled = 1", "recovery.enabled must be like True"),
-        ("[extrema]\nmin_curvature = 'low'", "extrema.min_curvature must be like 0.3"),
+        ("[extrema]\nmin_curvature = 'low'", "extrema.min_curvature must be like 0.15"),
         ("[fusion]\nvoxel_high = 'fine'", "fusion.voxel_high must be like None"),
         ("[extrema_tracking]\nprediction = 'dense-flow'", "extrema_tracking.prediction must be one of"),
         ("[bundle_adjustment]\nkeyframe_solver = 'ceres'", "bundle_adjustment.keyframe_solver must be one of"),

@@ -83,13 +83,13 @@ def test_a_reduced_flow_is_sampled_on_the_pixel_centres_of_the_picture():
     np.testing.assert_allclose(predict_by_dense_flow(pixels, flow, 3), pixels + 3 * reduced * [0.1, 0.05], atol=1e-5)
 
 
-def test_a_far_extremum_is_a_miss_where_the_others_are_near():
+def test_an_extremum_beyond_the_gate_is_a_miss():
     kappa = np.zeros((40, 200), np.float32)
     kappa[20, 10:190:10] = 5.0
     seen = np.array([[u + 0.1, 20.0] for u in range(10, 190, 10)])
     seen[3, 0] += 1.0
     tracks = tracks_at(seen)
-    moved = track_extrema(tracks, tracks.pixels, kappa, dataclasses.replace(CONFIG, gate_px=1.5, gate_medians=2.5, min_gate_px=0.5))
+    moved = track_extrema(tracks, tracks.pixels, kappa, dataclasses.replace(CONFIG, gate_px=0.5))
     assert moved.missed[3] == 1 and np.delete(moved.missed, 3).max() == 0
 
 
@@ -130,13 +130,16 @@ def test_a_wrong_prediction_is_a_miss_not_a_jump(moving):
     assert len(seen) < 0.6 * len(pixels)
 
 
-def test_a_track_coasts_one_frame_and_is_then_dropped():
+def test_a_track_coasts_so_many_frames_and_is_then_dropped():
     flat = np.zeros((40, 40), np.float32)
     start = tracks_at([[20.0, 20.0]], ids=[7], ages=[5])
     coasting = track_extrema(start, np.array([[21.0, 19.0]]), flat, CONFIG)
     assert (coasting.ids[0], coasting.missed[0], coasting.ages[0]) == (7, 1, 6)
     np.testing.assert_array_equal(coasting.pixels, [[21.0, 19.0]])
     assert coasting.kappa[0] == start.kappa[0]
+    for _ in range(CONFIG.coast_frames - 1):
+        coasting = track_extrema(coasting, np.array([[22.0, 18.0]]), flat, CONFIG)
+        assert len(coasting) == 1
     assert len(track_extrema(coasting, np.array([[22.0, 18.0]]), flat, CONFIG)) == 0
     assert len(track_extrema(start, np.array([[21.0, 19.0]]), flat, dataclasses.replace(CONFIG, coast_frames=0))) == 0
 

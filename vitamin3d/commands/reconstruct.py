@@ -22,10 +22,21 @@ class Mode(str, Enum):
     paper = "paper"
 
 
+class Refine(str, Enum):
+    """When the calibration is refined."""
+
+    auto = "auto"
+    on = "on"
+    off = "off"
+
+
 def reconstruct(
     source: Annotated[Path, typer.Argument(help="EuRoC, TUM or KITTI folder, folder of pictures, or video.")],
     out: Annotated[Path, typer.Option("--out", "-o", help="Folder for the results.")],
     calibration: Annotated[Path | None, typer.Option(help="Camera file with the fields of EuRoC's sensor.yaml.")] = None,
+    refine_calibration: Annotated[
+        Refine | None, typer.Option(help="Focal length and radial distortion: auto refines them where the motion determines them.")
+    ] = None,
     mode: Annotated[Mode, typer.Option(help="default: what measures best; paper: the literal paper.")] = Mode.default,
     config: Annotated[Path | None, typer.Option(help="TOML file with settings that differ from the mode's.")] = None,
     threads: Annotated[bool, typer.Option("--threads/--sequential", help="Overlap the steps, or one after the other.")] = True,
@@ -47,7 +58,7 @@ def reconstruct(
     from vitamin3d.job import Job, Selection
 
     job = Job(
-        _settings(mode, config, seed, _voxels(voxel_low, voxel_high, metric_scale, scale_from_ground_truth)),
+        _settings(mode, config, seed, refine_calibration, _voxels(voxel_low, voxel_high, metric_scale, scale_from_ground_truth)),
         Selection(start, max_frames, stride),
         threads,
         metric_scale,
@@ -89,13 +100,15 @@ def _voxels(low: float | None, high: float | None, metric_scale: float | None, f
     return given
 
 
-def _settings(mode: Mode, path: Path | None, seed: int | None, voxels: dict[str, Any]) -> "Config":
+def _settings(mode: Mode, path: Path | None, seed: int | None, refine: Refine | None, voxels: dict[str, Any]) -> "Config":
     import dataclasses
 
     from vitamin3d.config import load_toml
 
     config = _named(mode) if path is None else load_toml(path, _named(mode))
     config = config if seed is None else dataclasses.replace(config, seed=seed)
+    if refine is not None:
+        config = dataclasses.replace(config, calibration=dataclasses.replace(config.calibration, refine=refine.value))
     return dataclasses.replace(config, fusion=dataclasses.replace(config.fusion, **voxels))
 
 
@@ -126,6 +139,12 @@ def _conclude(outcome: "Outcome", out: Path) -> int:
         f"{stats['tracked_frames']} of {stats['frames']} frames localised, {stats['keyframes']} keyframes, "
         f"{stats['cloud_points']} points, {stats['wall_seconds']:.0f} s; {outcome.scale.remark}"
     )
+    if stats["calibration"]["refined"]:
+        given, used = stats["calibration"]["given"], stats["calibration"]["used"]
+        typer.echo(
+            f"calibration refined: fx {given['fx']:.1f} to {used['fx']:.1f} px, k1 {given['k1']:.4f} to {used['k1']:.4f}; "
+            f"see {out / 'calibration.yaml'}"
+        )
     for name in ("mesh_high.ply", "mesh_high.obj", "mesh_low.ply", "cloud.ply", "trajectory.tum"):
         if (out / name).exists():
             typer.echo(f"  {out / name}")

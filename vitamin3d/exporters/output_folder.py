@@ -28,6 +28,7 @@ FILES = (
     "mesh_low.ply",
     "mesh_high.ply",
     "mesh_high.obj",
+    "calibration.yaml",
     "config.toml",
     "stats.json",
     "tracks.npz",
@@ -37,6 +38,15 @@ FOLDERS = ("normals", "depth", "evaluation", "comparison")
 DEPTH_COUNTS_PER_METRE = 1000.0
 DEPTH_COUNTS_PER_UNIT = 5000.0
 PROGRAM = "vitamin3d"
+
+
+def _camera_yaml(camera: Camera) -> str:
+    """The fields of EuRoC's `sensor.yaml`."""
+    return (
+        f"camera_model: pinhole\nintrinsics: [{camera.fx!r}, {camera.fy!r}, {camera.cx!r}, {camera.cy!r}]\n"
+        f"distortion_model: radial-tangential\ndistortion_coefficients: {list(camera.distortion)!r}\n"
+        f"resolution: [{camera.width}, {camera.height}]\n"
+    )
 
 
 def depth_counts(scale: Scale) -> float:
@@ -108,14 +118,16 @@ class OutputFolder:
             if name == "mesh_high":
                 write_obj(scaled, self.path / f"{name}.obj", comments)
 
+    def write_calibration(self, camera: Camera, remark: str) -> None:
+        """`calibration.yaml`: the camera that was used, for --calibration."""
+        write_file(self.path / "calibration.yaml", [f"# {PROGRAM}: {remark}\n{_camera_yaml(camera)}".encode()])
+
     def write_canvas(self, canvas: Camera, scale: Scale) -> None:
         """`depth/canvas.yaml`: the pinhole camera of the depth and normal maps, and the unit of depth."""
         counts = DEPTH_COUNTS_PER_METRE if scale.is_known else DEPTH_COUNTS_PER_UNIT
         text = (
             "# pinhole camera of the depth and normal maps: the undistorted picture on a canvas that holds all of it\n"
-            f"camera_model: pinhole\nintrinsics: [{canvas.fx!r}, {canvas.fy!r}, {canvas.cx!r}, {canvas.cy!r}]\n"
-            "distortion_model: radial-tangential\ndistortion_coefficients: [0.0, 0.0, 0.0, 0.0]\n"
-            f"resolution: [{canvas.width}, {canvas.height}]\n"
+            f"{_camera_yaml(canvas)}"
             f"depth_counts_per_{'metre' if scale.is_known else 'map_unit'}: {counts}\n"
         )
         write_file(self._folder("depth") / "canvas.yaml", [text.encode()])

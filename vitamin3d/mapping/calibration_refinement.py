@@ -11,7 +11,7 @@ from dataclasses import dataclass, field
 import numpy as np
 
 from vitamin3d.bundle_adjustment.problem import BundleProblem, points_of_long_tracks, select_points
-from vitamin3d.bundle_adjustment.self_calibration import CalibrationReport, adjust_with_intrinsics
+from vitamin3d.bundle_adjustment.self_calibration import CalibrationReport, adjust_with_intrinsics, parameter_basis
 from vitamin3d.config import CalibrationConfig
 from vitamin3d.geometry.camera import Camera
 from vitamin3d.mapping.sparse_map import SparseMap
@@ -83,7 +83,18 @@ class CalibrationRefinement:
         focal = deviations.get("f", 0.0) / refined.fx
         if focal > self.config.max_focal_deviation:
             return f"the motion does not determine the focal length (± {100.0 * focal:.1f} %)"
+        if not self._was_refined() and self._distance(report, refined) < self.config.significance:
+            return "the given calibration agrees with the pictures"
         return ""
+
+    def _was_refined(self) -> bool:
+        return any(refinement.accepted for refinement in self.history)
+
+    def _distance(self, report: CalibrationReport, refined: Camera) -> float:
+        """From the given calibration, all parameters together, in standard deviations (Mahalanobis)."""
+        basis = parameter_basis(report.names, self.given.fy / self.given.fx)
+        moved = np.linalg.pinv(basis) @ (refined.model - self.given.model)
+        return float(np.sqrt(moved @ np.linalg.solve(report.covariance, moved))) / self.config.systematic_factor
 
 
 def _store(sparse_map: SparseMap, chosen: BundleProblem, old: Camera, new: Camera, config: CalibrationConfig) -> None:

@@ -90,20 +90,12 @@ def track_extrema(tracks: Tracks, predicted: Array, kappa: Array, config: Extrem
     pixels, values, found = np.empty((n, 2)), np.empty(n, np.float32), np.empty(n, np.bool_)
     weight, sigma = config.prediction_weight, config.prediction_sigma_px
     _climb_all(kappa, np.ascontiguousarray(predicted), weight, sigma, config.max_steps, config.gate_px, pixels, values, found)
-    found &= _is_near(predicted, pixels, found, config)
     missed = np.where(found, 0, tracks.missed + 1).astype(np.int32)
     kept = np.where(found, values, tracks.kappa).astype(np.float32)
     moved = Tracks(tracks.ids, np.where(found[:, None], pixels, predicted), kept, tracks.ages + np.int32(1), missed)
     height, width = kappa.shape
     inside = (pixels > 1).all(axis=1) & (pixels < [width - 2, height - 2]).all(axis=1)
     return merge_meeting_tracks(moved.select((missed <= config.coast_frames) & inside), width)
-
-
-def _is_near(predicted: Array, pixels: Array, found: Array, config: ExtremaTrackingConfig) -> Array:
-    """(N,) bool: climbs that ended as near to their prediction as this frame's others."""
-    distances = np.linalg.norm(pixels - predicted, axis=1)
-    median = float(np.median(distances[found])) if found.any() else config.gate_px
-    return np.asarray(distances <= max(config.min_gate_px, config.gate_medians * median))
 
 
 def merge_meeting_tracks(tracks: Tracks, width: int) -> Tracks:
