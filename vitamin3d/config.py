@@ -235,13 +235,13 @@ class CalibrationConfig:
     points_per_keyframe: int = 400
     """Landmarks with the most observations that take part, about so many in each keyframe."""
     sigma_px: float = 1.0
-    iterations: int = 25
+    iterations: int = 12
     prior_focal: float = 0.05
     """Standard deviation of the focal length around the one before, relative."""
     prior_distortion: float = 0.1
     systematic_factor: float = 10.0
     """True deviations over those of independent errors: rolling shutter, tracks cut short, the model of the lens."""
-    max_focal_deviation: float = 0.01
+    max_focal_deviation: float = 0.02
     """Relative, systematic errors included; above it the motion does not determine the focal length."""
     significance: float = 3.0
     """Deviations by which the parameters together must differ from the given ones before `auto` believes that those are wrong."""
