@@ -74,7 +74,7 @@ class ExtremaTrackingConfig:
 
     prediction: str = "dense_flow"
     """`dominant_flow` (Eq. 4, the paper) or `dense_flow` (DIS flow, several times more survivors)."""
-    flow_reduction: int = 2
+    flow_reduction: int = 3
     """The dense flow is computed on the picture reduced by this."""
     prediction_weight: float = 0.3
     """lambda of Eq. 5, relative to the noise floor's unit of kappa."""
@@ -160,7 +160,8 @@ class RecoveryConfig:
     max_distance_ratio: float = 1.25
     gate_px: float = 2.0
     min_zncc: float = 0.8
-    patch_px: int = 9
+    merge_distance: float = 0.02
+    """A landmark that meets a tracked one becomes one with it where they are this near in space, relative to the depth; 0: never."""
     min_observations: int = 3
 
 

@@ -19,7 +19,7 @@ from vitamin3d.geometry.se3 import inverse
 from vitamin3d.mapping.calibration_refinement import CalibrationRefinement
 from vitamin3d.mapping.initialization_history import InitializationHistory, TrackedView
 from vitamin3d.mapping.keyframe_selection import is_keyframe
-from vitamin3d.mapping.landmark_recovery import cut_patches, patch_similarity, recover_landmarks
+from vitamin3d.mapping.landmark_recovery import cut_patches, patch_similarity, recover_landmarks, same_landmarks
 from vitamin3d.mapping.landmark_statistics import keyframe_vertices
 from vitamin3d.mapping.landmark_triangulation import triangulate_landmarks
 from vitamin3d.mapping.map_initialization import add_view, build_first_map
@@ -53,6 +53,7 @@ class Slam:
         self.calibration = CalibrationRefinement(camera, config.calibration)
         self._history = InitializationHistory(config.initialization)
         self._pending_frames: dict[int, Frame] = {}
+        self._meetings: list[Array] = []
         self._next_id = 0
         self._frame_count = 0
 
@@ -195,7 +196,8 @@ class Slam:
         before = self.tracks.ids
         image, recovery = front.frame.image, self.config.recovery
         recovery = recovery if gate_px is None else replace(recovery, gate_px=gate_px)
-        self.tracks = recover_landmarks(self.tracks, self.map, image, front.kappa, T_cam_world, self.camera, recovery)
+        self.tracks, meetings = recover_landmarks(self.tracks, self.map, image, front.kappa, T_cam_world, self.camera, recovery)
+        self._meetings.append(meetings)
         return int((~np.isin(self.tracks.ids, before)).sum())
 
     def _relocalize(self, T_cam_world: Array) -> Array:
@@ -214,6 +216,7 @@ class Slam:
     def _map(self, front: FrontEndFrame, T_cam_world: Array) -> None:
         """Keyframes, landmarks, and bundle adjustment on every frame (Eq. 11–12)."""
         if self._is_keyframe(front.frame):
+            self._merge_landmarks(T_cam_world)
             keyframe = self._add_keyframe(front, T_cam_world)
             triangulate_landmarks(self.map, self.camera, self.config.triangulation)
             self._adjust_window()
@@ -238,6 +241,15 @@ class Slam:
         self._pending_frames[keyframe] = front.frame
         self._pending_frames.pop(keyframe - UNTAKEN_WINDOWS * self.config.window.keyframes, None)
         return keyframe
+
+    def _merge_landmarks(self, T_cam_world: Array) -> None:
+        """Landmarks that met tracked ones since the last keyframe and are the same become one, the older."""
+        meetings = np.concatenate([*self._meetings, np.zeros((0, 2), np.int64)])
+        pairs = same_landmarks(meetings, self.tracks, self.map, T_cam_world, self.config.recovery.merge_distance)
+        self._meetings.clear()
+        if len(pairs):
+            self.map.merge_landmarks(pairs[:, 0], pairs[:, 1])
+            self.tracks = self.tracks.renamed(pairs[:, 1], pairs[:, 0])
 
     def _adjust_window(self) -> None:
         """The keyframe's adjustment of the window and its landmarks, anchored; outliers leave the map and the tracks."""

@@ -82,6 +82,12 @@ class Tracks:
         """The tracks of a mask (N,) bool, of indices, or of a slice."""
         return Tracks(self.ids[keep], self.pixels[keep], self.kappa[keep], self.ages[keep], self.missed[keep])
 
+    def renamed(self, old: Array, new: Array) -> "Tracks":
+        """The tracks with ids `old` (M,), all of them there, replaced by `new` (M,)."""
+        ids, order = self.ids.copy(), np.argsort(self.ids)
+        ids[order[np.searchsorted(self.ids, old, sorter=order)]] = new
+        return Tracks(ids, self.pixels, self.kappa, self.ages, self.missed)
+
     @staticmethod
     def empty() -> "Tracks":
         return Tracks(np.zeros(0, np.int64), np.zeros((0, 2)), np.zeros(0, np.float32), np.zeros(0, np.int32), np.zeros(0, np.int32))

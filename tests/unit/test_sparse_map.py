@@ -8,7 +8,7 @@ from vitamin3d.geometry.se3 import exp_se3, inverse
 from vitamin3d.mapping.keyframe_selection import is_keyframe
 from vitamin3d.mapping.pose_log import PoseLog
 from vitamin3d.mapping.sparse_map import SparseMap
-from vitamin3d.types import Frame
+from vitamin3d.types import Frame, Tracks
 
 
 def add(sparse_map, ids, seed=0, T=None):
@@ -196,3 +196,47 @@ def test_prediction_stands_still_after_a_gap(scene):
     log.add_world(Frame(30, 0, NO_PICTURE), scene.T_cam_world[3], sparse_map)
     log.add_world(Frame(35, 1, NO_PICTURE), scene.T_cam_world[4], sparse_map)
     np.testing.assert_allclose(log.predict(sparse_map), scene.T_cam_world[4], atol=1e-13)
+
+
+def test_merging_gives_the_observations_to_one_landmark():
+    sparse_map = SparseMap()
+    for k, ids in enumerate(([0, 1, 2], [0, 2], [0, 1, 3], [3, 1], [3, 2, 1])):
+        add(sparse_map, ids, k)
+    sparse_map.points_world[:] = np.arange(12.0).reshape(4, 3)
+    sparse_map.remove_observations(np.array([9]))  # landmark 1 in keyframe 3
+    patches = sparse_map.patches.copy()
+    sparse_map.merge_landmarks(np.array([0]), np.array([3]))
+    rows = reference.counting_observations(sparse_map, 0)
+    assert [k for _, k in rows] == [0, 1, 2, 3, 4]  # in keyframe 2 both were seen: that of 0 stays
+    assert rows[2][0] == 5 and not sparse_map.obs_valid[7]
+    assert sparse_map.num_observations[0] == 5 and (sparse_map.first_observation[0], sparse_map.last_observation[0]) == (0, 10)
+    assert not sparse_map.is_mapped(np.array([3]))[0] and reference.counting_observations(sparse_map, 3) == []
+    np.testing.assert_array_equal(sparse_map.points_world[0], [0, 1, 2])  # as many observations each: the kept one's
+    np.testing.assert_array_equal(sparse_map.patches[0], patches[3])  # the latest looks
+    np.testing.assert_array_equal(sparse_map.points_world[[1, 2]], [[3, 4, 5], [6, 7, 8]])
+    check_counts(sparse_map)
+
+
+def test_merging_does_not_revive_what_no_longer_counts():
+    sparse_map = SparseMap()
+    for k, ids in enumerate(([0, 1], [0, 1], [0], [1], [0])):
+        add(sparse_map, ids, k)
+    sparse_map.points_world[:] = 1.0
+    sparse_map.remove_landmarks(np.array([0]))  # starts afresh below
+    add(sparse_map, [0], 5)
+    add(sparse_map, [0], 6)
+    sparse_map.points_world[0] = 2.0
+    sparse_map.merge_landmarks(np.array([0]), np.array([1]))
+    assert [k for _, k in reference.counting_observations(sparse_map, 0)] == [0, 1, 3, 5, 6]
+    np.testing.assert_array_equal(sparse_map.obs_landmark[sparse_map.obs_valid], [0, 0, 0, 0, 0])
+    np.testing.assert_array_equal(sparse_map.points_world[0], 1.0)  # three observations against two
+    check_counts(sparse_map)
+
+
+def test_tracks_are_renamed():
+    zeros = np.zeros(3, np.int32)
+    tracks = Tracks(np.array([7, 3, 9]), np.arange(6.0).reshape(3, 2), np.ones(3, np.float32), zeros, zeros)
+    renamed = tracks.renamed(np.array([9, 7]), np.array([1, 2]))
+    np.testing.assert_array_equal(renamed.ids, [2, 3, 1])
+    np.testing.assert_array_equal(renamed.pixels, tracks.pixels)
+    np.testing.assert_array_equal(tracks.ids, [7, 3, 9])

@@ -92,8 +92,8 @@ def _visible_candidates(sparse_map: SparseMap, live_ids: Array, T_cam_world: Arr
 
 def recover_landmarks(
     tracks: Tracks, sparse_map: SparseMap, image: Array, kappa: Array, T_cam_world: Array, camera: Camera, config: RecoveryConfig
-) -> Tracks:
-    """The tracks with those landmarks added that came back into view.
+) -> tuple[Tracks, Array]:
+    """The tracks with those landmarks added that came back into view, and the ids (N, 2) of landmarks that met tracked ones there.
 
     A landmark is taken up where its projection climbs to a maximum of kappa within the gate and the patch of its last
     keyframe agrees. It takes the place of a track that is no landmark; where a landmark is already tracked, it stays.
@@ -116,11 +116,18 @@ def recover_landmarks(
     return _take_up(tracks, sparse_map.is_mapped(tracks.ids), ids, pixels, kappa)
 
 
-def _take_up(tracks: Tracks, is_mapped: Array, ids: Array, pixels: Array, kappa: Array) -> Tracks:
-    """Adds landmarks `ids` at `pixels`; per pixel a live landmark stays, else the oldest of the new ones comes."""
+def _take_up(tracks: Tracks, is_mapped: Array, ids: Array, pixels: Array, kappa: Array) -> tuple[Tracks, Array]:
+    """Adds landmarks `ids` at `pixels`; per pixel a live landmark stays, else the oldest of the new ones comes.
+
+    Returns:
+        The tracks, and per pixel where a live landmark stayed the oldest of the new ones and its id (N, 2).
+    """
     width = kappa.shape[1]
     unit = np.array([1, width])
     place, live_place = np.rint(pixels).astype(np.int64) @ unit, np.rint(tracks.pixels).astype(np.int64) @ unit
+    seen = is_mapped & (tracks.missed == 0)
+    _, new, live = np.intersect1d(place, live_place[seen], return_indices=True)
+    meetings = np.stack([ids[new], tracks.ids[seen][live]], axis=1)
     free = ~np.isin(place, live_place[is_mapped])
     ids, pixels, place = ids[free], pixels[free], place[free]
     _, first = np.unique(place, return_index=True)
@@ -128,4 +135,17 @@ def _take_up(tracks: Tracks, is_mapped: Array, ids: Array, pixels: Array, kappa:
     remaining = tracks.select(~np.isin(live_place, place))
     at = np.rint(pixels).astype(np.int64)
     ages, missed = np.zeros(len(ids), np.int32), np.zeros(len(ids), np.int32)
-    return Tracks.concatenate(remaining, Tracks(ids, pixels, kappa[at[:, 1], at[:, 0]], ages, missed))
+    return Tracks.concatenate(remaining, Tracks(ids, pixels, kappa[at[:, 1], at[:, 0]], ages, missed)), meetings
+
+
+def same_landmarks(meetings: Array, tracks: Tracks, sparse_map: SparseMap, T_cam_world: Array, max_distance: float) -> Array:
+    """Of landmarks that met tracked ones (N, 2) the pairs (M, 2) that are one: near each other in space, relative to their depth."""
+    usable = sparse_map.is_mapped(meetings[:, 0]) & sparse_map.is_mapped(meetings[:, 1])
+    usable &= np.isin(meetings[:, 1], tracks.ids) & ~np.isin(meetings[:, 0], tracks.ids)
+    pairs = meetings[usable]
+    a, b = sparse_map.points_world[pairs[:, 0]], sparse_map.points_world[pairs[:, 1]]
+    depth = b @ T_cam_world[2, :3] + T_cam_world[2, 3]
+    pairs = pairs[np.linalg.norm(a - b, axis=1) < max_distance * depth]
+    for column in (0, 1):
+        pairs = pairs[np.unique(pairs[:, column], return_index=True)[1]]
+    return np.asarray(pairs[~np.isin(pairs[:, 0], pairs[:, 1])])

@@ -8,9 +8,41 @@ observations count from that moment.
 
 import numpy as np
 
+from vitamin3d._jit import kernel
 from vitamin3d.types import Array
 
 PATCH_PX = 9
+
+
+@kernel
+def _relabel(starts, obs_landmark, obs_valid, first, new_id, is_target, count, first_new, last_new):  # type: ignore[no-untyped-def]
+    """Gives observations of landmark i to new_id[i] (where >= 0) unless that has one in the same keyframe; recounts the targets.
+
+    Observations that do not count (older than `first`) of either become invalid, so that they cannot count again.
+    """
+    owner = np.full(first.shape[0], -1, np.int64)
+    for k in range(starts.shape[0] - 1):
+        for i in range(starts[k], starts[k + 1]):
+            id_ = obs_landmark[i]
+            if is_target[id_]:
+                obs_valid[i] &= i >= first[id_]
+                if obs_valid[i]:
+                    owner[id_] = k
+                    count[id_] += 1
+                    first_new[id_] = i if first_new[id_] < 0 else first_new[id_]
+                    last_new[id_] = i
+        for i in range(starts[k], starts[k + 1]):
+            id_ = obs_landmark[i]
+            target = new_id[id_]
+            if target < 0:
+                continue
+            obs_valid[i] &= i >= first[id_] and owner[target] != k
+            if obs_valid[i]:
+                obs_landmark[i] = target
+                owner[target] = k
+                count[target] += 1
+                first_new[target] = i if first_new[target] < 0 else min(i, first_new[target])
+                last_new[target] = i
 
 
 class _Growing:
@@ -184,6 +216,24 @@ class SparseMap:
         self._points.view[ids] = np.nan
         self._first.view[ids] = -1
         self._count.view[ids] = 0
+
+    def merge_landmarks(self, kept: Array, gone: Array) -> None:
+        """Gives the observations of landmarks `gone` (N,) to `kept` (N,), all different; where both have one, kept's stays.
+
+        The point is that of the one with more observations, the looks are the latest.
+        """
+        size = len(self.points_world)
+        new_id, is_target = np.full(size, -1, np.int64), np.zeros(size, np.bool_)
+        new_id[gone], is_target[kept] = kept, True
+        better, later = self.num_observations[gone] > self.num_observations[kept], self.last_observation[gone] > self.last_observation[kept]
+        self._points.view[kept[better]] = self.points_world[gone[better]]
+        self._colors.view[kept[later]], self._patches.view[kept[later]] = self.colors[gone[later]], self.patches[gone[later]]
+        count, first, last = np.zeros(size, np.int32), np.full(size, -1, np.int64), np.full(size, -1, np.int64)
+        _relabel(
+            np.array(self.keyframe_starts), self.obs_landmark, self.obs_valid, self.first_observation, new_id, is_target, count, first, last
+        )
+        self._count.view[kept], self._first.view[kept], self._last.view[kept] = count[kept], first[kept], last[kept]
+        self.remove_landmarks(gone)
 
     def clone_pose(self, keyframe: int) -> Array:
         """T_cam_world (4, 4) of a keyframe, a copy."""

@@ -18,9 +18,10 @@ def climb(kappa, u, v, predicted_u, predicted_v, weight, squared_sigma, max_step
         best_u, best_v = u, v
         for n in range(v - 1, v + 2):
             for m in range(u - 1, u + 2):
-                value = kappa[n, m] + weight * squared_sigma / ((m - predicted_u) ** 2 + (n - predicted_v) ** 2 + squared_sigma)
-                if value > best:
-                    best, best_u, best_v = value, m, n
+                if kappa[n, m] + weight > best:  # no w is above 1: saves most of the divisions
+                    value = kappa[n, m] + weight * squared_sigma / ((m - predicted_u) ** 2 + (n - predicted_v) ** 2 + squared_sigma)
+                    if value > best:
+                        best, best_u, best_v = value, m, n
         if best_u == u and best_v == v:
             return u, v, True
         u, v = best_u, best_v
