@@ -20,7 +20,7 @@ else:
 
 CHOICES = {
     "extrema_tracking.prediction": ("dense_flow", "dominant_flow"),
-    "bundle_adjustment.keyframe_solver": ("schur", "subspace"),
+    "bundle_adjustment.keyframe_solver": ("subspace-accelerated", "schur", "subspace"),
     "fusion.backend": ("scalable", "voxel_block_grid"),
     "calibration.refine": ("auto", "on", "off"),
 }
@@ -199,8 +199,9 @@ class BundleAdjustmentConfig:
     sigma_px: float = 2.0
     sweeps_per_frame: int = 2
     """Subspace Gauss–Newton sweeps over the window at every frame (Eq. 11–12)."""
-    keyframe_solver: str = "schur"
-    """Solver of the window at each keyframe: `schur` (Levenberg–Marquardt, reduced camera system) or `subspace`."""
+    keyframe_solver: str = "subspace-accelerated"
+    """Solver of the window at each keyframe: `subspace-accelerated` (cameras together with the points eliminated, then each
+    point alone), `schur` (the former only) or `subspace` (Eq. 11–12)."""
     keyframe_iterations: int = 6
     relative_gain: float = 1e-3
     """An adjustment ends when a step lowers the cost by less than this share."""

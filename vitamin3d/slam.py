@@ -10,7 +10,7 @@ import numpy as np
 
 from vitamin3d.bundle_adjustment.adjust import adjust_bundle
 from vitamin3d.bundle_adjustment.problem import BundleProblem
-from vitamin3d.bundle_adjustment.schur import adjust_schur
+from vitamin3d.bundle_adjustment.schur import adjust_accelerated
 from vitamin3d.bundle_adjustment.subspace import adjust_subspace
 from vitamin3d.bundle_adjustment.variables import squared_reprojection_errors
 from vitamin3d.config import Config
@@ -300,7 +300,7 @@ class Slam:
         with self._timed("final_adjustment"):
             for sigma, outlier in ((window_round.sigma_px, window_round.outlier_px), (final.sigma_px, final.outlier_px)):
                 problem = build_problem(self.map, everything)
-                solved, _ = adjust_schur(problem, self.camera, sigma, final.iterations, final.relative_gain)
+                solved, _ = adjust_accelerated(problem, self.camera, sigma, final.iterations, final.relative_gain)
                 store_solution(self.map, everything, solved)
                 self._remove_outliers(everything, solved, outlier)
 

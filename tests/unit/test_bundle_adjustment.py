@@ -11,7 +11,7 @@ from scipy.spatial.transform import Rotation
 
 from vitamin3d.bundle_adjustment.adjust import SOLVERS, adjust_bundle
 from vitamin3d.bundle_adjustment.schur import ReducedSystem, adjust_schur
-from vitamin3d.bundle_adjustment.subspace import adjust_subspace, total_cost
+from vitamin3d.bundle_adjustment.subspace import adjust_subspace, by_camera_of, new_scratch, sweep_cameras, sweep_points, total_cost
 from vitamin3d.bundle_adjustment.variables import (
     Variables,
     free_slots,
@@ -236,3 +236,71 @@ def test_the_settings_name_the_solver(start):
     for name, solver in (("schur", adjust_schur), ("subspace", adjust_subspace)):
         config = BundleAdjustmentConfig(sigma_px=1.5, keyframe_solver=name, keyframe_iterations=2)
         np.testing.assert_array_equal(adjust_bundle(start, PINHOLE, config)[0].points_world, solver(start, PINHOLE, 1.5, 2)[0].points_world)
+
+
+def test_a_sweep_allocates_nothing(start):
+    """Counted by numba's own runtime, which also counts one for each array that Python hands over."""
+    runtime = pytest.importorskip("numba.core.runtime")
+    runtime._nrt_python.memsys_enable_stats()
+    variables, scratch = Variables.of(start, pinhole_model(PINHOLE)), new_scratch()
+    views, sightings, by_camera = variables.views(free_slots(start)), sightings_of(start), by_camera_of(start)
+    before = runtime.rtsys.get_allocation_stats().alloc
+    sweep_cameras(views, by_camera, variables.points, 0.25, scratch)
+    sweep_points(views, sightings, variables.points, 0.25, scratch)
+    handed_over = len(views) + len(by_camera) + 1 + len(scratch) + len(views) + len(sightings) + 1 + len(scratch)
+    assert runtime.rtsys.get_allocation_stats().alloc - before in (0, handed_over)
+
+
+@pytest.mark.parametrize("own", [False, True])
+def test_one_step_with_camera_parameters_equals_the_dense_solve(own):
+    """The full matrix by finite differences of all residuals; shared parameters as a border, own ones in the cameras' blocks."""
+    rng = np.random.default_rng(4)
+    scene = arc_scene(4, 20, rng)
+    scene = dataclasses.replace(scene, pixels=scene.pixels + rng.normal(0, 0.5, scene.pixels.shape))
+    poses, points = perturbed(scene, rng, 0.005, 0.02)
+    problem = problem_of(scene, 2, poses, points)
+    models = np.repeat(PINHOLE.with_model([520, 510, 321.5, 239, -0.1, 0.02, 0, 0]).model[None], 4 if own else 1, axis=0)
+    basis, free, damping = np.zeros((8, 2)), (2, 3), 0.01
+    basis[:2, 0], basis[4, 1] = (1.0, 510 / 520), 1.0
+    num_models = len(free) if own else 1
+
+    def moved(x):
+        T, m = problem.T_cam_world.copy(), models.copy()
+        for n, c in enumerate(free):
+            T[c] = reference.exp_se3(x[6 * n : 6 * n + 6]) @ T[c]
+        for n, c in enumerate(free if own else (0,)):
+            m[c] += basis @ x[12 + 2 * n : 14 + 2 * n]
+        return T, m, problem.points_world + x[12 + 2 * num_models :].reshape(-1, 3)
+
+    def residuals(x):
+        T, m, X = moved(x)
+        rows = []
+        for c, p, u in zip(problem.obs_camera, problem.obs_point, problem.obs_pixels, strict=True):
+            camera = PINHOLE.with_model(m[c if own else 0])
+            rows.append((camera.distort(camera.ideal_from_points((T[c] @ np.append(X[p], 1))[None, :3])) - u)[0])
+        return np.array(rows)
+
+    size = 12 + 2 * num_models + 60
+    J = np.stack([(residuals(1e-6 * d) - residuals(-1e-6 * d)) / 2e-6 for d in np.eye(size)], axis=-1)
+    r = residuals(np.zeros(size))
+    w = reference.geman_mcclure_weight(np.linalg.norm(r, axis=1), SIGMA)
+    H, g = np.einsum("mia,m,mib->ab", J, w, J), np.einsum("mia,m,mi->a", J, w, r)
+    expected = moved(-np.linalg.solve(H + damping * np.diag(np.diag(H)), g))
+    system = ReducedSystem(sightings_of(problem), free_slots(problem), SIGMA, basis, own)
+    step = system.step(Variables.of(problem, models), damping).moved
+    np.testing.assert_allclose(step.R, expected[0][:, :3, :3], atol=1e-7)
+    np.testing.assert_allclose(step.t, expected[0][:, :3, 3], atol=1e-6)
+    np.testing.assert_allclose(step.models, expected[1], rtol=1e-6, atol=1e-6)
+    np.testing.assert_allclose(step.points, expected[2], atol=1e-5)
+    assert np.abs(step.models - models).max() > 0.1
+
+
+def test_the_kernels_bending_is_bounded_and_only_along_the_residual(rng):
+    problem = small(1)
+    variables = Variables.of(problem, pinhole_model(PINHOLE))
+    traces = []
+    for bend in (0.0, 0.5):
+        system = ReducedSystem(sightings_of(problem), free_slots(problem), SIGMA)
+        system.build(variables, 0.0, bend)
+        traces.append(np.trace(system.equations.H_cameras[0]))
+    assert 0.5 * traces[0] < traces[1] < traces[0]

@@ -166,8 +166,10 @@ def information(r0, r1, p00, p01, p10, p11, inverse_squared_sigma, most_bend):  
 
 @inlined
 def add_camera(H, f, g, at, q, a, b, g00, g01, g11, h0, h1):  # type: ignore[no-untyped-def]
-    """Adds an observation to block f of H (F, 6.., 6..) and the gradient g from `at`: Jᵀ G J and Jᵀ h, upper triangle."""
-    ab, a1, b1 = a * b, 1.0 + a * a, 1.0 + b * b
+    """Adds an observation to block f of H (F, 6.., 6..) and the gradient g from `at`: Jᵀ G J and Jᵀ h, upper triangle.
+
+    J is that of `linearize_normalized` without p; m = G (a, b), n = G (-b, a), written out: there is no time for loops.
+    """
     hz = a * h0 + b * h1
     g[at] += q * h0
     g[at + 1] += q * h1
@@ -175,33 +177,30 @@ def add_camera(H, f, g, at, q, a, b, g00, g01, g11, h0, h1):  # type: ignore[no-
     g[at + 3] -= b * hz + h1
     g[at + 4] += h0 + a * hz
     g[at + 5] += a * h1 - b * h0
-    u, v = g00 * q, g01 * q
-    H[f, 0, 0] += u * q
-    H[f, 0, 1] += v * q
-    H[f, 0, 2] -= q * (u * a + v * b)
-    H[f, 0, 3] -= u * ab + v * b1
-    H[f, 0, 4] += u * a1 + v * ab
-    H[f, 0, 5] += v * a - u * b
-    u, v = g01 * q, g11 * q
-    H[f, 1, 1] += v * q
-    H[f, 1, 2] -= q * (u * a + v * b)
-    H[f, 1, 3] -= u * ab + v * b1
-    H[f, 1, 4] += u * a1 + v * ab
-    H[f, 1, 5] += v * a - u * b
-    u, v = -q * (g00 * a + g01 * b), -q * (g01 * a + g11 * b)
-    H[f, 2, 2] -= q * (u * a + v * b)
-    H[f, 2, 3] -= u * ab + v * b1
-    H[f, 2, 4] += u * a1 + v * ab
-    H[f, 2, 5] += v * a - u * b
-    u, v = -g00 * ab - g01 * b1, -g01 * ab - g11 * b1
-    H[f, 3, 3] -= u * ab + v * b1
-    H[f, 3, 4] += u * a1 + v * ab
-    H[f, 3, 5] += v * a - u * b
-    u, v = g00 * a1 + g01 * ab, g01 * a1 + g11 * ab
-    H[f, 4, 4] += u * a1 + v * ab
-    H[f, 4, 5] += v * a - u * b
-    u, v = g01 * a - g00 * b, g11 * a - g01 * b
-    H[f, 5, 5] += v * a - u * b
+    m0, m1, n0, n1 = g00 * a + g01 * b, g01 * a + g11 * b, g01 * a - g00 * b, g11 * a - g01 * b
+    k, nz = a * m0 + b * m1, a * n0 + b * n1
+    q0, q1, q2, qm0, qm1, qk = q * g00, q * g01, q * g11, q * m0, q * m1, q * k
+    H[f, 0, 0] += q * q0
+    H[f, 0, 1] += q * q1
+    H[f, 0, 2] += -q * qm0
+    H[f, 0, 3] += -b * qm0 - q1
+    H[f, 0, 4] += a * qm0 + q0
+    H[f, 0, 5] += q * n0
+    H[f, 1, 1] += q * q2
+    H[f, 1, 2] += -q * qm1
+    H[f, 1, 3] += -b * qm1 - q2
+    H[f, 1, 4] += a * qm1 + q1
+    H[f, 1, 5] += q * n1
+    H[f, 2, 2] += q * qk
+    H[f, 2, 3] += b * qk + qm1
+    H[f, 2, 4] += -a * qk - qm0
+    H[f, 2, 5] += -q * nz
+    H[f, 3, 3] += b * (b * k + 2.0 * m1) + g11
+    H[f, 3, 4] += -b * (a * k + m0) - a * m1 - g01
+    H[f, 3, 5] += -b * nz - n1
+    H[f, 4, 4] += a * (a * k + 2.0 * m0) + g00
+    H[f, 4, 5] += a * nz + n0
+    H[f, 5, 5] += a * n1 - b * n0
 
 
 @inlined

@@ -1,6 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """Levenberg–Marquardt on the reduced camera system (Eq. 9–10): all variables move together, the points eliminated."""
 
+from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
@@ -17,7 +18,7 @@ from vitamin3d.bundle_adjustment.normal_equations import (
     squared_errors,
 )
 from vitamin3d.bundle_adjustment.problem import BundleProblem
-from vitamin3d.bundle_adjustment.subspace import new_scratch, sweep_points
+from vitamin3d.bundle_adjustment.subspace import Scratch, new_scratch, sweep_points
 from vitamin3d.bundle_adjustment.variables import Progress, Variables, free_slots, pinhole_model, sightings_of
 from vitamin3d.geometry.camera import Camera
 from vitamin3d.types import Array, BundleReport
@@ -25,6 +26,10 @@ from vitamin3d.types import Array, BundleReport
 FIRST_DAMPING = 1e-4
 MIN_DAMPING = 1e-9
 MAX_DAMPING = 1e8
+MOST_BEND = 0.5
+"""More of the kernel's bending makes the steps so long that many are refused."""
+NEAR_GAIN = 0.02
+"""The bending is used after a step that gained no more than this share: far from the minimum it hinders."""
 LEAST_INFORMATION = 1e-12
 """What is left of a shared parameter's information when all else is free is rounding below this share of it."""
 NO_BASIS = np.zeros((8, 0))
@@ -194,27 +199,35 @@ def _adjust(
 
 
 def minimise(
-    system: ReducedSystem, variables: Variables, iterations: int, relative_gain: float, point_sweeps: int = 0
+    system: ReducedSystem,
+    variables: Variables,
+    iterations: int,
+    relative_gain: float,
+    point_sweeps: int = 0,
+    is_settled: Callable[[Step, float], bool] | None = None,
+    first_damping: float = FIRST_DAMPING,
 ) -> tuple[Variables, Progress]:
-    """Damped steps until one of them gains less than a share of the cost; after each the points alone are swept, if asked for."""
-    progress, damping, scratch = Progress(), FIRST_DAMPING, new_scratch()
+    """Damped steps until one of them gains less than a share of the cost; after each the points alone are swept, if asked for.
+
+    With `is_settled`, which is asked about each step and its damping, that must be so as well.
+    """
+    progress, damping, is_near, scratch = Progress(), first_damping, False, new_scratch()
     for _ in range(iterations):
-        step = system.step(variables, damping)
-        cost = step.cost
-        for _ in range(point_sweeps if np.isfinite(cost) else 0):
-            views = step.moved.views(system.slot)
-            *_, cost = sweep_points(views, system.sightings, step.moved.points, system.inverse_squared_sigma, scratch)
-            cost += system.prior_cost(step.moved, step.shared)
+        step = system.step(variables, damping, MOST_BEND if is_near else 0.0)
+        cost = _swept(system, step, point_sweeps, scratch)
         if not progress.costs:
             progress.costs.append(step.cost_before)
         accepted = cost <= progress.costs[-1]
         progress.costs.append(min(cost, progress.costs[-1]))
         progress.steps.append((step.gradient_norm, step.largest_pose, step.largest_point))
+        gain = progress.costs[-2] - progress.costs[-1]
+        is_near = accepted and gain <= NEAR_GAIN * progress.costs[-1]
         if accepted:
+            settled = is_settled is None or is_settled(step, damping)
             system.from_start = system.from_start + step.shared
             variables, damping = step.moved, max(MIN_DAMPING, 0.1 * damping)
-            if progress.costs[-2] - progress.costs[-1] <= relative_gain * progress.costs[-1]:
-                progress.stopped = "gain"
+            if settled and gain <= relative_gain * progress.costs[-1]:
+                progress.stopped = "gain" if is_settled is None else "settled"
                 break
         else:
             damping *= 10.0
@@ -224,3 +237,13 @@ def minimise(
     if not progress.costs:
         progress.costs.append(system.build(variables, 0.0, 0.0)[0])
     return variables, progress
+
+
+def _swept(system: ReducedSystem, step: Step, sweeps: int, scratch: Scratch) -> float:
+    """The cost after the step and so many sweeps over its points."""
+    cost = step.cost
+    for _ in range(sweeps if np.isfinite(cost) else 0):
+        views = step.moved.views(system.slot)
+        *_, cost = sweep_points(views, system.sightings, step.moved.points, system.inverse_squared_sigma, scratch)
+        cost += system.prior_cost(step.moved, step.shared)
+    return cost

@@ -12,7 +12,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from vitamin3d.bundle_adjustment.problem import BundleProblem
-from vitamin3d.bundle_adjustment.schur import LEAST_INFORMATION, ReducedSystem
+from vitamin3d.bundle_adjustment.schur import LEAST_INFORMATION, ReducedSystem, Step, minimise
 from vitamin3d.bundle_adjustment.variables import Progress, Variables, free_slots, sightings_of
 from vitamin3d.errors import InputError
 from vitamin3d.geometry.camera import Camera
@@ -22,15 +22,9 @@ from vitamin3d.types import Array
 PARAMETERS = ("f", "fx", "fy", "cx", "cy", "k1", "k2", "p1", "p2")
 """`f` moves fx and fy together, their ratio kept."""
 FIRST_DAMPING = 1e-5
-MIN_DAMPING = 1e-9
-MAX_DAMPING = 1e6
 SETTLED_DAMPING = 1e-6
 SETTLED_DEVIATIONS = 0.1
 """The parameters are settled when an almost undamped step moves none of them by more than this share of its deviation."""
-MOST_BEND = 0.5
-"""More makes the steps so long that many are refused."""
-NEAR_GAIN = 0.02
-"""The kernel's bending is used where a step gains no more than this share: far from the minimum it hinders."""
 
 
 @dataclass(frozen=True)
@@ -83,42 +77,17 @@ def adjust_with_intrinsics(
     noise_px = _noise(ReducedSystem(sightings, free_slots(problem), sigma_px).squared_errors(variables), problem, len(free), sigma_px)
     prior = np.array([(noise_px / priors[name]) ** 2 if priors and name in priors else 0.0 for name in free])
     system = ReducedSystem(sightings, free_slots(problem), sigma_px, basis, prior=prior)
-    variables, progress = _minimise(system, variables, noise_px, iterations, relative_gain)
+
+    def is_settled(step: Step, damping: float) -> bool:
+        deviations = noise_px * np.sqrt(np.diag(_covariance(step.information, step.information_alone)))
+        in_deviations = float(np.max(np.abs(step.shared) / deviations, initial=0.0))
+        return damping <= SETTLED_DAMPING and in_deviations <= SETTLED_DEVIATIONS
+
+    variables, progress = minimise(system, variables, iterations, relative_gain, 1, is_settled, FIRST_DAMPING)
     refined = camera.with_model(variables.models[0])
     pixels = refined.undistort(camera.distort(problem.obs_pixels))
     solved = dataclasses.replace(variables.written_to(problem), obs_pixels=pixels)
     return solved, refined, _report(system, variables, problem, refined, tuple(free), sigma_px, progress)
-
-
-def _minimise(
-    system: ReducedSystem, variables: Variables, noise_px: float, iterations: int, relative_gain: float
-) -> tuple[Variables, Progress]:
-    """Damped steps until the shared parameters are settled and a step gains little."""
-    progress, damping, is_near = Progress(), FIRST_DAMPING, False
-    for _ in range(iterations):
-        step = system.step(variables, damping, MOST_BEND if is_near else 0.0)
-        if not progress.costs:
-            progress.costs.append(step.cost_before)
-        accepted = step.cost <= progress.costs[-1]
-        progress.costs.append(min(step.cost, progress.costs[-1]))
-        progress.steps.append((step.gradient_norm, step.largest_pose, step.largest_point))
-        gain = progress.costs[-2] - progress.costs[-1]
-        is_near = accepted and gain <= NEAR_GAIN * progress.costs[-1]
-        if accepted:
-            system.from_start = system.from_start + step.shared
-            deviations = noise_px * np.sqrt(np.diag(_covariance(step.information, step.information_alone)))
-            in_deviations = float(np.max(np.abs(step.shared) / deviations, initial=0.0))
-            is_settled = damping <= SETTLED_DAMPING and in_deviations <= SETTLED_DEVIATIONS
-            variables, damping = step.moved, max(MIN_DAMPING, 0.1 * damping)
-            if is_settled and gain <= relative_gain * progress.costs[-1]:
-                progress.stopped = "settled"
-                break
-        else:
-            damping *= 10.0
-        if damping > MAX_DAMPING:
-            progress.stopped = "no descent"
-            break
-    return variables, progress
 
 
 def parameter_basis(free: Sequence[str], aspect: float) -> Array:

@@ -44,7 +44,9 @@ class ByCamera(NamedTuple):
     """(M, 2)."""
 
 
-class _Scratch(NamedTuple):
+class Scratch(NamedTuple):
+    """Memory of the sweeps: a block, its right-hand side and step, and where it would lead."""
+
     H: Array
     """(1, 6, 6)."""
     g: Array
@@ -59,9 +61,9 @@ class _Scratch(NamedTuple):
     """(1, 3)."""
 
 
-def new_scratch() -> _Scratch:
+def new_scratch() -> Scratch:
     """Memory for the sweeps."""
-    return _Scratch(*(np.empty(shape) for shape in ((1, 6, 6), 6, 6, (1, 3, 3), (1, 3), (1, 3))))
+    return Scratch(*(np.empty(shape) for shape in ((1, 6, 6), 6, 6, (1, 3, 3), (1, 3), (1, 3))))
 
 
 @inlined

@@ -12,10 +12,10 @@ import numpy as np
 
 from vitamin3d.bundle_adjustment.problem import BundleProblem, points_of_long_tracks, select_points
 from vitamin3d.bundle_adjustment.self_calibration import CalibrationReport, adjust_with_intrinsics, parameter_basis
+from vitamin3d.bundle_adjustment.subspace import adjust_subspace
 from vitamin3d.config import CalibrationConfig
 from vitamin3d.geometry.camera import Camera
 from vitamin3d.mapping.sparse_map import SparseMap
-from vitamin3d.mapping.subspace_bundle_adjustment import adjust_subspace
 from vitamin3d.mapping.window_selection import build_problem, store_solution, whole_map
 
 POINT_SWEEPS = 2

@@ -1,0 +1,289 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Measures the bundle adjustment: BAL problems, windows recorded from a real run, a whole map; one core.
+
+    python tools/benchmark_bundle_adjustment.py bal problem-16-22106-pre.txt.bz2 problem-49-7776-pre.txt.bz2
+    python tools/benchmark_bundle_adjustment.py record SEQUENCE WINDOWS --keyframes 12 --anchors 15
+    python tools/benchmark_bundle_adjustment.py windows WINDOWS/window_*.npz
+    python tools/benchmark_bundle_adjustment.py map WINDOWS/map.npz
+
+`bal` and `map` also run Ceres by way of pycolmap (`pip install pycolmap`) in the same process, on the same core, from the same start,
+where it is installed. Times are the least of several runs of the whole call, setup included.
+"""
+
+import argparse
+import dataclasses
+import os
+import sys
+import time
+from collections.abc import Callable, Iterator
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from vitamin3d.bundle_adjustment.adjust import SOLVERS, AdjustmentSettings, adjust
+from vitamin3d.bundle_adjustment.problem import BundleProblem, make_problem
+from vitamin3d.bundle_adjustment.rejection import reject
+from vitamin3d.bundle_adjustment.self_calibration import adjust_with_intrinsics
+from vitamin3d.bundle_adjustment.subspace import by_camera_of, new_scratch, sweep_cameras, sweep_points
+from vitamin3d.bundle_adjustment.variables import Variables, free_slots, pinhole_model, sightings_of
+from vitamin3d.config import Config
+from vitamin3d.datasets import Unreadable, open_dataset
+from vitamin3d.datasets.bal import read_bal
+from vitamin3d.errors import InputError, Vitamin3dError
+from vitamin3d.geometry.camera import Camera
+from vitamin3d.geometry.se3 import exp_se3, inverse, log_so3
+from vitamin3d.mapping.window_selection import build_problem, select_window, whole_map
+from vitamin3d.runtime import run_sequential
+from vitamin3d.slam import Slam
+from vitamin3d.tracking.front_end import FrontEnd
+from vitamin3d.types import Array
+
+REPEATS = 5
+NEAR_SHARE, POSE_SHARE = 0.01, 0.05
+MOVED_M, TURNED_DEG, DEPTH_SHARE = 0.01, 0.5, 0.02
+"""How a window's start is perturbed: camera centres, rotations, depths from the first camera that sees a point; one deviation each."""
+
+
+def least_seconds(function: Callable[[], Any], repeats: int = REPEATS) -> tuple[float, Any]:
+    """Seconds of the fastest of several calls, and its result."""
+    best, result = np.inf, None
+    for _ in range(repeats):
+        start = time.perf_counter()
+        result = function()
+        best = min(best, time.perf_counter() - start)
+    return best, result
+
+
+# --- BAL ---------------------------------------------------------------------------------------------------------
+
+
+def compare_on_bal(path: Path) -> None:
+    """Half the sum of squares at the end, and the time until it is within a hundredth of that."""
+    problem, models = read_bal(path)
+    problem, rejection = reject(problem, models)
+    print(f"{path.name}: {len(models)} cameras, {len(problem.obs_pixels)} observations; left out: {rejection.summary() or 'nothing'}")
+    ceres = ceres_solver()
+    best = None
+    if ceres:
+        run = ceres(problem, models)
+        best = run.cost
+        near = next(r for k in range(1, 100) if (r := ceres(problem, models, iterations=k)).cost <= (1.0 + NEAR_SHARE) * best)
+        _row("ceres", run.cost, run.iterations, run.seconds, near.iterations, near.seconds)
+    for name in ("schur", "subspace-accelerated"):
+        settings = AdjustmentSettings(name, np.inf, iterations=100, relative_gain=1e-7, free=("f", "k1", "k2"), own=True)
+        seconds, adjusted = least_seconds(partial(adjust, problem, models, settings))
+        costs = 0.5 * adjusted.report.costs
+        steps = int(np.flatnonzero(costs <= (1.0 + NEAR_SHARE) * (best or costs[-1]))[0])
+        short = dataclasses.replace(settings, iterations=steps)
+        near_seconds, _ = least_seconds(partial(adjust, problem, models, short))
+        _row(name, costs[-1], len(costs) - 1, seconds, steps, near_seconds)
+
+
+def _row(name: str, cost: float, steps: int, seconds: float, near_steps: int, near_seconds: float) -> None:
+    print(f"  {name:22} cost {cost:12.2f} in {steps:3} steps, {1e3 * seconds:7.1f} ms; ", end="")
+    print(f"within 1 % in {near_steps:2} steps, {1e3 * near_seconds:7.1f} ms")
+
+
+def ceres_solver() -> Callable[..., Any] | None:
+    """`solve_with_ceres` where pycolmap is installed."""
+    try:
+        import pycolmap  # type: ignore[import-not-found,unused-ignore]  # noqa: F401
+    except ImportError:
+        print("  (pycolmap is not installed: no reference)")
+        return None
+    from bundle_adjustment_ceres import solve_with_ceres
+
+    return solve_with_ceres
+
+
+# --- windows of a real run ---------------------------------------------------------------------------------------
+
+
+class RecordingSlam(Slam):
+    """Saves the problem of the window, as the tracker starts it, at some keyframes; its ideal pixels are of `camera`."""
+
+    folder, every = Path(), 30
+
+    def _adjust_window(self) -> None:
+        if self.map.num_keyframes % self.every == 0:
+            problem = build_problem(self.map, select_window(self.map, self.config.window))
+            save_problem(self.folder / f"window_{self.map.num_keyframes:04d}.npz", problem, self.camera)
+        super()._adjust_window()
+
+
+def record(source: str, folder: Path, keyframes: int, anchors: int, every: int, frames: int) -> None:
+    """Runs the sparse half and writes window_*.npz and map.npz, the whole map before its final adjustment."""
+    config = Config()
+    window = dataclasses.replace(config.window, keyframes=keyframes, anchors=anchors)
+    config = dataclasses.replace(config, window=window, calibration=dataclasses.replace(config.calibration, refine="off"))
+    dataset = open_dataset(Path(source))
+    if isinstance(dataset, Unreadable):
+        raise InputError(f"{source}: {dataset.reason}")
+    folder.mkdir(parents=True, exist_ok=True)
+    slam = RecordingSlam(dataset.camera, config)
+    slam.folder, slam.every = folder, every
+    run_sequential(dataset, range(min(frames, len(dataset))), FrontEnd(config), slam)
+    save_problem(folder / "map.npz", build_problem(slam.map, whole_map(slam.map)), slam.camera)
+
+
+def save_problem(path: Path, problem: BundleProblem, camera: Camera) -> None:
+    """Writes a problem in measured pixels with its camera."""
+    fields = {field.name: getattr(problem, field.name) for field in dataclasses.fields(problem)}
+    fields["obs_pixels"] = camera.distort(problem.obs_pixels)
+    np.savez(path, model=camera.model, size=[camera.width, camera.height], **fields)
+
+
+def load_problem(path: Path) -> tuple[BundleProblem, Camera]:
+    """The problem in ideal pixels, and the camera."""
+    with np.load(path) as data:
+        width, height = (int(n) for n in data["size"])
+        camera = Camera(1.0, 1.0, 0.0, 0.0, width, height).with_model(data["model"])
+        made = make_problem(
+            data["T_cam_world"], data["points_world"], data["obs_camera"], data["obs_point"], camera.undistort(data["obs_pixels"]),
+            data["camera_is_free"],
+        )  # fmt: skip
+    return made, camera
+
+
+def perturbed(problem: BundleProblem, metres_per_unit: float, rng: np.random.Generator) -> BundleProblem:
+    """Free cameras and all points moved from where they are."""
+    poses, points = problem.T_cam_world.copy(), problem.points_world.copy()
+    first = problem.obs_camera[problem.point_order[np.minimum(problem.point_starts[:-1], len(problem.point_order) - 1)]]
+    centers = inverse(poses)[first, :3, 3]
+    points = centers + (points - centers) * (1.0 + DEPTH_SHARE * rng.standard_normal((len(points), 1)))
+    for c in np.flatnonzero(problem.camera_is_free):
+        T_world_cam = inverse(poses[c])
+        turn = exp_se3(np.r_[np.zeros(3), np.radians(TURNED_DEG) * rng.standard_normal(3)])
+        T_world_cam = T_world_cam @ turn
+        T_world_cam[:3, 3] += MOVED_M / metres_per_unit * rng.standard_normal(3)
+        poses[c] = inverse(T_world_cam)
+    return dataclasses.replace(problem, T_cam_world=poses, points_world=points)
+
+
+def distances(a: BundleProblem, b: BundleProblem) -> Array:
+    """(3,) RMS distance of the free cameras' centres, RMS angle between them in degrees, median distance of the points."""
+    free = a.camera_is_free
+    centers = [inverse(p.T_cam_world[free])[:, :3, 3] for p in (a, b)]
+    turns = a.T_cam_world[free, :3, :3] @ np.swapaxes(b.T_cam_world[free, :3, :3], 1, 2)
+    angles = [np.degrees(np.linalg.norm(log_so3(R))) for R in turns]
+    moved = np.linalg.norm(centers[0] - centers[1], axis=1)
+    apart = np.linalg.norm(a.points_world - b.points_world, axis=1)
+    return np.array([np.sqrt(np.mean(moved**2)), np.sqrt(np.mean(np.square(angles))), np.median(apart)])
+
+
+def compare_on_window(path: Path, metres_per_unit: float, sigma_px: float) -> None:
+    """Until the camera centres, rotations and points have come within a twentieth of their start's distance from the optimum."""
+    problem, camera = load_problem(path)
+    print(_size(path, problem))
+    optimum, _ = SOLVERS["schur"](problem, camera, sigma_px, 200, 1e-10)
+    for start_name, start in (("live", problem), ("perturbed", perturbed(problem, metres_per_unit, np.random.default_rng(0)))):
+        before = distances(start, optimum)
+        print(f"  {start_name} start, away from the optimum: {before[0]:.4g} units, {before[1]:.3g}°, points {before[2]:.4g}")
+        for name, limit in (("subspace", 400), ("subspace-accelerated", 30), ("schur", 30)):
+            print(f"    {name:22} {_time_to_arrive(name, start, optimum, before, camera, sigma_px, limit)}")
+
+
+def _size(path: Path, problem: BundleProblem) -> str:
+    free, all_ = int(problem.camera_is_free.sum()), len(problem.camera_is_free)
+    counts = f"{len(problem.points_world)} landmarks, {len(problem.obs_pixels)} observations"
+    return f"{path.name}: {free} free and {all_ - free} fixed keyframes, {counts}"
+
+
+def _time_to_arrive(
+    name: str, start: BundleProblem, optimum: BundleProblem, before: Array, camera: Camera, sigma_px: float, limit: int
+) -> str:
+    for steps in _growing(limit):
+        solved, _ = SOLVERS[name](start, camera, sigma_px, steps, 0.0)
+        left = distances(solved, optimum) / np.maximum(before, 1e-12)
+        if left.max() <= POSE_SHARE:
+            seconds, _ = least_seconds(partial(SOLVERS[name], start, camera, sigma_px, steps, 0.0))
+            return f"{steps:3} steps, {1e3 * seconds:7.1f} ms"
+    seconds, _ = least_seconds(partial(SOLVERS[name], start, camera, sigma_px, limit, 0.0), 1)
+    shares = f"{left[0]:.0%} of the way, {left[1]:.0%} of the angle, {left[2]:.0%} at points"
+    return f"not in {limit} steps, {1e3 * seconds:.0f} ms: left are {shares}"
+
+
+def _growing(limit: int) -> Iterator[int]:
+    """1, 2, 3, ... in steps that grow by a fifth."""
+    steps = 1
+    while steps <= limit:
+        yield steps
+        steps = max(steps + 1, int(1.2 * steps))
+
+
+def sweep_throughput(path: Path) -> None:
+    """Observations per second of a sweep over cameras and points, all cameras free."""
+    problem, camera = load_problem(path)
+    problem = dataclasses.replace(problem, camera_is_free=np.ones(len(problem.T_cam_world), np.bool_))
+    variables, scratch = Variables.of(problem, pinhole_model(camera)), new_scratch()
+    views, sightings, by_camera = variables.views(free_slots(problem)), sightings_of(problem), by_camera_of(problem)
+    cameras, _ = least_seconds(lambda: sweep_cameras(views, by_camera, variables.points, 0.25, scratch), 20)
+    points, _ = least_seconds(lambda: sweep_points(views, sightings, variables.points, 0.25, scratch), 20)
+    count = len(problem.obs_pixels)
+    print(f"{path.name}: {1e9 * cameras / count:.1f} + {1e9 * points / count:.1f} ns, {1e-6 * count / (cameras + points):.1f} million/s")
+
+
+def adjust_map(path: Path, sigma_px: float) -> None:
+    """The whole map with f k1 k2 shared and free; Ceres with a Cauchy loss of the same scale."""
+    problem, camera = load_problem(path)
+    print(_size(path, problem))
+    start = time.perf_counter()
+    _, found, report = adjust_with_intrinsics(problem, camera, ("f", "k1", "k2"), sigma_px, 100)
+    seconds = time.perf_counter() - start
+    deviation = report.deviations["f"]
+    _print_map("ours", seconds, len(report.costs) - 1, found.model, f" ({report.stopped}, deviation of f {deviation:.2f})")
+    ceres = ceres_solver()
+    if ceres and not any(camera.distortion[2:]):
+        measured = dataclasses.replace(problem, obs_pixels=camera.distort(problem.obs_pixels))
+        run = ceres(measured, camera.model[None], sigma_px, 100, 1e-6)
+        _print_map("ceres", run.seconds, run.iterations, run.models[0], "")
+
+
+def _print_map(name: str, seconds: float, steps: int, model: Array, more: str) -> None:
+    print(f"  {name:6} {seconds:6.2f} s, {steps:3} steps: f {model[0]:.2f}, k1 {model[4]:.4f}, k2 {model[5]:.4f}{more}")
+
+
+def parsed(argv: list[str] | None) -> argparse.Namespace:
+    """The command line."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    commands = parser.add_subparsers(dest="command", required=True)
+    for name in ("bal", "windows", "sweeps", "map"):
+        command = commands.add_parser(name)
+        command.add_argument("files", type=Path, nargs="+")
+        command.add_argument("--sigma", type=float, default=2.0 if name == "windows" else 1.0, help="of the robust kernel, pixels")
+        command.add_argument("--metres-per-unit", type=float, default=2.0, help="of the recorded map, for the perturbation")
+    command = commands.add_parser("record")
+    command.add_argument("source")
+    command.add_argument("folder", type=Path)
+    for name, default in (("keyframes", 12), ("anchors", 15), ("every", 30), ("frames", 10**9)):
+        command.add_argument(f"--{name}", type=int, default=default)
+    return parser.parse_args(argv)
+
+
+def main(argv: list[str] | None = None) -> int:
+    """Runs the command; 2 for bad input."""
+    arguments = parsed(argv)
+    if hasattr(os, "sched_setaffinity"):
+        os.sched_setaffinity(0, {min(os.sched_getaffinity(0))})
+    try:
+        if arguments.command == "record":
+            record(arguments.source, arguments.folder, arguments.keyframes, arguments.anchors, arguments.every, arguments.frames)
+        for path in arguments.files if arguments.command != "record" else []:
+            if arguments.command == "bal":
+                compare_on_bal(path)
+            elif arguments.command == "windows":
+                compare_on_window(path, arguments.metres_per_unit, arguments.sigma)
+            elif arguments.command == "sweeps":
+                sweep_throughput(path)
+            else:
+                adjust_map(path, arguments.sigma)
+    except Vitamin3dError as error:
+        print(error, file=sys.stderr)
+        return 2
+    return 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())
