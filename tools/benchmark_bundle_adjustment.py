@@ -6,8 +6,8 @@
     python tools/benchmark_bundle_adjustment.py windows WINDOWS/window_*.npz
     python tools/benchmark_bundle_adjustment.py map WINDOWS/map.npz
 
-`bal` and `map` also run Ceres by way of pycolmap (`pip install pycolmap`) in the same process, on the same core, from the same start,
-where it is installed. Times are the least of several runs of the whole call, setup included.
+`bal` and `map` also run Ceres by way of pycolmap (`pip install 'vitamin3d[reference]'`) in the same process, on the same core,
+from the same start, where it is installed. Times are the least of several runs of the whole call, setup included.
 """
 
 import argparse
