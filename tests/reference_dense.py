@@ -113,3 +113,79 @@ def vertex_normals(vertices, triangles):
         for v in (a, b, c):
             normals[v] += np.cross(vertices[b] - vertices[a], vertices[c] - vertices[a])
     return np.array([n / np.linalg.norm(n) if np.linalg.norm(n) > 0 else n for n in normals])
+
+
+def census(image):
+    """Strings of "darker than the centre" over the 9×7 window, row by row; None where it leaves the image or holds a zero."""
+    height, width = image.shape
+    out = np.full(image.shape, None, object)
+    for v, u in itertools.product(range(3, height - 3), range(4, width - 4)):
+        window = image[v - 3 : v + 4, u - 4 : u + 5].astype(int)
+        if (window > 0).all():
+            out[v, u] = "".join("1" if x < image[v, u] else "0" for x in np.delete(window.ravel(), 31))
+    return out
+
+
+def sweep_cost(image, sources, motions, camera, inverse_depths):
+    """Cost (H, W, D): the mean of the two lowest census distances among the sources that see the point."""
+    reference, others = census(image), [census(source) for source in sources]
+    cost = np.full((*image.shape, len(inverse_depths)), 24.0)
+    for v, u, d in np.ndindex(cost.shape):
+        if reference[v, u] is None:
+            continue
+        distances = []
+        for signature, motion in zip(others, motions, strict=True):
+            x = np.array([(u - camera.cx) / camera.fx, (v - camera.cy) / camera.fy, 1.0]) + inverse_depths[d] * motion
+            a, b = camera.fx * x[0] / x[2] + camera.cx, camera.fy * x[1] / x[2] + camera.cy
+            a, b = int(a + 0.5), int(b + 0.5)
+            if 0 <= a < camera.width and 0 <= b < camera.height and signature[b, a] is not None:
+                distances.append(sum(p != q for p, q in zip(reference[v, u], signature[b, a], strict=True)))
+        if distances:
+            lowest = sorted(distances)[:2]
+            cost[v, u, d] = np.mean(lowest) + (2.0 if len(lowest) == 1 else 0.0)
+    return cost
+
+
+def path_cost(cost, image, small, large, step):
+    """Costs of one path, pixel by pixel along `step` (dv, du), by the definition."""
+    out = np.zeros(cost.shape)
+    height, width, planes = cost.shape
+    rows = range(height) if step[0] >= 0 else range(height - 1, -1, -1)
+    columns = range(width) if step[1] >= 0 else range(width - 1, -1, -1)
+    for v, u in itertools.product(rows, columns):
+        w, x = v - step[0], u - step[1]
+        if not (0 <= w < height and 0 <= x < width):
+            out[v, u] = cost[v, u]
+            continue
+        edge = max(large * 10.0 / (10.0 + abs(float(image[v, u]) - float(image[w, x]))), 1.5 * small)
+        before = out[w, x]
+        for d in range(planes):
+            jumps = [before[k] + (0 if k == d else small if abs(k - d) == 1 else edge) for k in range(planes)]
+            out[v, u, d] = cost[v, u, d] + min(min(jumps), before.min() + edge) - before.min()
+    return out
+
+
+def zncc(a, b):
+    a, b = a - a.mean(), b - b.mean()
+    return float((a * b).sum() / np.sqrt((a**2).sum() * (b**2).sum() + 1e-9))
+
+
+def signed_distances(views, canvas, points, truncation, max_depth):
+    """Weighted mean distances along the rays (N,), in truncations, and weights (N,) of points (N, 3), view by view."""
+    total, weight = np.zeros(len(points)), np.zeros(len(points))
+    for view in views:
+        for n, point in enumerate(points):
+            x = view.T_cam_world[:3, :3] @ point + view.T_cam_world[:3, 3]
+            if x[2] <= 0:
+                continue
+            u = int(np.floor(canvas.fx * x[0] / x[2] + canvas.cx + 0.5))
+            v = int(np.floor(canvas.fy * x[1] / x[2] + canvas.cy + 0.5))
+            if not (0 <= u < canvas.width and 0 <= v < canvas.height and 0 < view.depth[v, u] < max_depth):
+                continue
+            signed = (view.depth[v, u] - x[2]) * np.linalg.norm(x / x[2]) / truncation
+            if signed < -1:
+                continue
+            w = view.weights[v, u] * min(1.0, 1.0 + signed)
+            total[n] += w * min(signed, 1.0)
+            weight[n] += w
+    return total / np.maximum(weight, 1e-30), weight

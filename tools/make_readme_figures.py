@@ -1,8 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
 """Makes a picture of a run: tracked extrema over a frame, the mesh, and its normal maps at both voxel sizes (Fig. 3).
 
-    vitamin3d reconstruct SOURCE -o OUT --save-tracks
-    python tools/make_readme_figures.py SOURCE OUT picture.jpg --keyframe 60 --back 0.3 --up 0.2
+vitamin3d reconstruct SOURCE -o OUT --save-tracks
+python tools/make_readme_figures.py SOURCE OUT picture.jpg --keyframe 60 --back 0.3 --up 0.2
 """
 
 import argparse

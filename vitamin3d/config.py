@@ -21,7 +21,7 @@ else:
 CHOICES = {
     "extrema_tracking.prediction": ("dense_flow", "dominant_flow"),
     "bundle_adjustment.keyframe_solver": ("subspace-accelerated", "schur", "subspace"),
-    "fusion.backend": ("scalable", "voxel_block_grid"),
+    "fusion.backend": ("blocks", "scalable", "voxel_block_grid"),
     "calibration.refine": ("auto", "on", "off"),
 }
 AT_LEAST_ONE = (
@@ -31,6 +31,8 @@ AT_LEAST_ONE = (
     "initialization.history",
     "recovery.interval",
     "window.keyframes",
+    "densification.keyframe_stride",
+    "densification.reach",
 )
 
 
@@ -271,14 +273,45 @@ class SnapshotConfig:
 
 
 @dataclass(frozen=True)
+class DensificationConfig:
+    """Depths of textured pixels between the landmarks, from neighbouring keyframes; not in the paper."""
+
+    enabled: bool = True
+    keyframe_stride: int = 2
+    """Every so many-th keyframe is densified and fused; the others serve as its neighbours."""
+    reach: int = 13
+    """Keyframes before and after among which neighbours are looked for."""
+    near_parallax_deg: float = 3.0
+    """Two neighbours on each side, with about these parallaxes."""
+    far_parallax_deg: float = 6.0
+    min_overlap: float = 0.5
+    """Share of the landmarks that a neighbour must see."""
+    min_landmarks: int = 30
+    planes: int = 64
+    small_penalty: float = 5.0
+    """Of a step to the next plane, in bits of the census."""
+    edge_penalty: float = 50.0
+    """Of a larger step, where the picture has no edge."""
+    cell_px: int = 8
+    """One pixel per cell at most becomes a vertex."""
+    min_distinctness: float = 1.3
+    """Aggregated cost of the best other plane over the winner's."""
+    max_cost: float = 16.0
+    """Bits of the census in which the winner may differ."""
+    patch_px: int = 9
+    min_zncc: float = 0.7
+    sigma_px: float = 1.0
+    """Deviation of a refined match in one neighbour."""
+    max_relative_deviation: float = 0.3
+
+
+@dataclass(frozen=True)
 class DelaunayConfig:
     """Sec. 4.2: landmarks to a triangulation of the picture."""
 
     min_vertices: int = 30
     min_separation_px: float = 1.0
     """Of two landmarks nearer than this in the image, the more certain one becomes a vertex."""
-    weight_scale: float = 0.02
-    """Data weight of a vertex = weight_scale / relative deviation of its depth."""
     deviation_floor: float = 0.01
     """Relative, added in quadrature: what landmarks share (poses, calibration) and mismatches are not in their deviations."""
 
@@ -291,6 +324,8 @@ class NltgvConfig:
     iterations: int = 400
     data_weight: float = 1.5
     """lambda."""
+    full_deviation: float = 0.02
+    """omega of a vertex = full_deviation / relative deviation of its depth."""
     slope_weight: float = 1.0
     """beta."""
     pixel_unit: float = 8.0
@@ -313,8 +348,9 @@ class DepthRenderingConfig:
 class FusionConfig:
     """Sec. 4.2: the two TSDF volumes."""
 
-    backend: str = "scalable"
-    """`scalable` (Open3D ScalableTSDFVolume) or `voxel_block_grid`."""
+    backend: str = "blocks"
+    """`blocks` (ours; every pixel weighs by the certainty of its depth), or Open3D's `scalable` (ScalableTSDFVolume) or
+    `voxel_block_grid`, where all weigh the same."""
     voxel_low: float | None = None
     """Metres where the scale is known, else map units; None: median depth of the scene / 20 (and / 120)."""
     voxel_high: float | None = None
@@ -323,6 +359,8 @@ class FusionConfig:
     keyframes_for_depth: int = 30
     """Keyframes whose depths decide the voxels; fusion waits for them where the voxels are not given."""
     truncation_voxels: float = 4.0
+    max_deviation_voxels: float = 5.0
+    """The surface ends where all views together leave a larger deviation of the depth (`blocks` alone)."""
     max_depth: float = 3.0
     """Depth beyond this many median depths of the scene is not fused."""
 
@@ -357,6 +395,7 @@ class Config:
     calibration: CalibrationConfig = field(default_factory=CalibrationConfig)
     cloud: CloudConfig = field(default_factory=CloudConfig)
     snapshot: SnapshotConfig = field(default_factory=SnapshotConfig)
+    densification: DensificationConfig = field(default_factory=DensificationConfig)
     delaunay: DelaunayConfig = field(default_factory=DelaunayConfig)
     nltgv: NltgvConfig = field(default_factory=NltgvConfig)
     depth_rendering: DepthRenderingConfig = field(default_factory=DepthRenderingConfig)
@@ -375,6 +414,7 @@ def paper_config() -> Config:
         relocalization=RelocalizationConfig(enabled=False),
         window=WindowConfig(anchors=0),
         final_adjustment=FinalAdjustmentConfig(enabled=False),
+        densification=DensificationConfig(enabled=False),
         calibration=CalibrationConfig(refine="off"),
         bundle_adjustment=BundleAdjustmentConfig(keyframe_solver="subspace", keyframe_iterations=20),
     )

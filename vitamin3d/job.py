@@ -19,7 +19,7 @@ from vitamin3d.runtime import Observer, RunRecord, run_ahead, run_sequential, ru
 from vitamin3d.scale import Scale, scale_from_ground_truth
 from vitamin3d.slam import Slam
 from vitamin3d.tracking.front_end import FrontEnd
-from vitamin3d.types import DepthView, MapSnapshot
+from vitamin3d.types import MapSnapshot
 
 VOXEL_LOW_M, VOXEL_HIGH_M = 0.15, 0.025
 """Table 3 of the paper; the defaults where the scale is known."""
@@ -156,25 +156,24 @@ class _Dense:
         self.reconstruction: Reconstruction | None = None
 
     def add(self, snapshot: MapSnapshot) -> None:
-        """Fuses a keyframe and writes its maps."""
-        view = self._begun().add_keyframe(snapshot)
-        if view is not None:
+        """Takes a keyframe; fuses those that are ready and writes their maps."""
+        for view in self._begun().add_keyframe(snapshot):
             self.output.write_view(view, self.scale)
 
     def add_all(self, slam: Slam, observer: Observer) -> None:
         """All keyframes of a finished map, their pictures read again; the views are computed ahead of the fusion."""
-        views = self._views(slam)
-        for done, view in enumerate(run_ahead(views) if self.job.threads else views, 1):
-            if view is not None:
-                self._begun().fuse(view)
-                self.output.write_view(view, self.scale)
-            observer.keyframe_done(done, slam.map.num_keyframes)
+        order = {time: k for k, time in enumerate(slam.map.timestamps_ns, 1)}
+        views = self._begun().depth_views(self._snapshots(slam))
+        for view in run_ahead(views) if self.job.threads else views:
+            self._begun().fuse(view)
+            self.output.write_view(view, self.scale)
+            observer.keyframe_done(order[view.timestamp_ns], slam.map.num_keyframes)
 
-    def _views(self, slam: Slam) -> Iterator[DepthView | None]:
-        reconstruction = self._begun()
+    def _snapshots(self, slam: Slam) -> Iterator[MapSnapshot]:
         for keyframe, frame_index in enumerate(slam.map.frame_indices):
             frame = self.dataset.read(frame_index)
-            yield None if isinstance(frame, Unreadable) else reconstruction.depth_view(slam.snapshot(keyframe, frame))
+            if not isinstance(frame, Unreadable):
+                yield slam.snapshot(keyframe, frame)
 
     def _begun(self) -> Reconstruction:
         if self.reconstruction is None:
@@ -183,7 +182,12 @@ class _Dense:
         return self.reconstruction
 
     def write_surfaces(self) -> None:
-        if self.reconstruction is not None and self.reconstruction.median_depths:
+        """Fuses what still waits, and writes the meshes."""
+        if self.reconstruction is None:
+            return
+        for view in self.reconstruction.finish():
+            self.output.write_view(view, self.scale)
+        if self.reconstruction.median_depths:
             self.output.write_surfaces(*self.reconstruction.surfaces(), self.scale, self.reconstruction.voxel_lengths())
 
     def voxels(self) -> dict[str, float] | None:

@@ -3,7 +3,7 @@
 
 import dataclasses
 import time
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from contextlib import contextmanager
 from dataclasses import replace
 
@@ -11,6 +11,7 @@ import numpy as np
 
 from vitamin3d.config import Config
 from vitamin3d.dense.delaunay import triangulate
+from vitamin3d.dense.densification import CanvasPicture, Densifier, KeyframeQueue, Neighbourhood, canvas_picture
 from vitamin3d.dense.depth_rendering import DepthRenderer
 from vitamin3d.dense.nltgv import denoise
 from vitamin3d.dense.surface_extraction import clean
@@ -18,6 +19,7 @@ from vitamin3d.dense.tsdf_fusion import TsdfVolume, empty_surface
 from vitamin3d.geometry.camera import Camera
 from vitamin3d.types import DepthView, MapSnapshot, StepTimes, Surface
 
+NO_PICTURE = np.zeros((0, 0), np.uint8)
 NO_NORMALS = np.zeros((0, 0, 3), np.float32)
 """Fusion needs depth and colour; the normals of waiting views are not kept."""
 
@@ -35,6 +37,9 @@ class Reconstruction:
         self.config = config
         self.times = times if times is not None else StepTimes()
         self.renderer = DepthRenderer(camera, config.depth_rendering)
+        densification = config.densification
+        self._densifier = Densifier(camera, self.renderer.canvas, densification)
+        self._queue = KeyframeQueue(densification.reach, densification.keyframe_stride)
         self.median_depths: list[float] = []
         self._waiting: list[DepthView] = []
         self.low: TsdfVolume | None = None
@@ -45,12 +50,42 @@ class Reconstruction:
         """The undistorted camera of the depth views."""
         return self.renderer.canvas
 
-    def add_keyframe(self, snapshot: MapSnapshot) -> DepthView | None:
-        """Meshes, denoises, renders and fuses a keyframe; None where it has too few landmarks."""
-        view = self.depth_view(snapshot)
-        if view is not None:
+    def add_keyframe(self, snapshot: MapSnapshot) -> list[DepthView]:
+        """Takes a keyframe, in the order of time, and fuses those that have all their neighbours by now; their views."""
+        return self._fused(self._depth_views(self._ready(snapshot)))
+
+    def finish(self) -> list[DepthView]:
+        """Fuses the keyframes that waited for neighbours; their views."""
+        return self._fused(self._depth_views(self._queue.flush()))
+
+    def depth_views(self, snapshots: Iterable[MapSnapshot]) -> Iterator[DepthView]:
+        """The views of a whole sequence of keyframes, not fused yet; those with too few landmarks have none."""
+        for snapshot in snapshots:
+            yield from self._depth_views(self._ready(snapshot))
+        yield from self._depth_views(self._queue.flush())
+
+    def _ready(self, snapshot: MapSnapshot) -> list[Neighbourhood]:
+        if not self.config.densification.enabled:
+            return [Neighbourhood(CanvasPicture(snapshot, NO_PICTURE, NO_PICTURE), [], [])]
+        image, outside = self.renderer.draw_gray(snapshot.frame), self.renderer.is_outside
+        return self._queue.push(canvas_picture(snapshot, image, outside))
+
+    def _fused(self, views: Iterator[DepthView]) -> list[DepthView]:
+        done = []
+        for view in views:
             self.fuse(view)
-        return view
+            done.append(view)
+        return done
+
+    def _depth_views(self, ready: list[Neighbourhood]) -> Iterator[DepthView]:
+        for neighbourhood in ready:
+            snapshot = neighbourhood.picture.snapshot
+            if self.config.densification.enabled:
+                with self._timed("densification"):
+                    snapshot = self._densifier.densify(neighbourhood)
+            view = self.depth_view(snapshot)
+            if view is not None:
+                yield view
 
     def depth_view(self, snapshot: MapSnapshot) -> DepthView | None:
         """Meshes, denoises and renders a keyframe; None where it has too few landmarks."""
@@ -71,7 +106,8 @@ class Reconstruction:
             self._fuse_waiting()
 
     def surfaces(self) -> tuple[Surface, Surface]:
-        """The coarse and the fine surface of all keyframes so far."""
+        """The coarse and the fine surface of all keyframes so far, those that still waited for neighbours included."""
+        self.finish()
         self._fuse_waiting()
         with self._timed("surface_low"):
             low = self._surface(self.low)
@@ -106,7 +142,9 @@ class Reconstruction:
             self.high.integrate(view, self.canvas, max_depth)
 
     def _volume(self, voxel_length: float) -> TsdfVolume:
-        return TsdfVolume(voxel_length, self.config.fusion.truncation_voxels * voxel_length, self.config.fusion.backend)
+        fusion = self.config.fusion
+        truncation, deviation = fusion.truncation_voxels * voxel_length, fusion.max_deviation_voxels * voxel_length
+        return TsdfVolume(voxel_length, truncation, deviation, fusion.backend)
 
     def _surface(self, volume: TsdfVolume | None) -> Surface:
         if volume is None or self.high is None:

@@ -173,8 +173,8 @@ class ImageMesh:
     """(E, 2) int32, each edge once."""
     inverse_depth: Array
     """(V,) float64, per map unit."""
-    weight: Array
-    """(V,) float64, data weight of NLTGV."""
+    relative_deviation: Array
+    """(V,) float64, standard deviation of the depth divided by the depth."""
 
 
 @dataclass(frozen=True)
@@ -190,6 +190,8 @@ class DepthView:
     """(H, W, 3) float32 unit vectors in the camera frame, towards the camera; 0 = none."""
     color: Array
     """(H, W, 3) uint8 RGB (grey pictures: three equal channels)."""
+    weights: Array
+    """(H, W) float32 inverse variance of the depth, per squared map unit; 0 = none."""
 
 
 @dataclass(frozen=True)

@@ -27,9 +27,7 @@ def score(what: str, sequence: str, *files: Path) -> dict[str, float]:
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize(
-    ("sequence", "frames", "success", "ate_cm"), [("kitchen", 1000, 0.95, 5.5), ("room1_v101_easy", 300, 0.42, 0.4)]
-)
+@pytest.mark.parametrize(("sequence", "frames", "success", "ate_cm"), [("kitchen", 1000, 0.95, 5.5), ("room1_v101_easy", 300, 0.42, 0.4)])
 def test_trajectories(sequence: str, frames: int, success: float, ate_cm: float, tmp_path: Path) -> None:
     done = reconstruct(sequence, tmp_path, "--scale-from-ground-truth", "--max-frames", str(frames))
     assert done.returncode == 0, done.stderr

@@ -50,14 +50,14 @@ def test_the_more_certain_of_two_close_landmarks_stays(snapshot):
 def test_weights_are_the_inverse_of_the_deviation_up_to_a_limit(snapshot):
     deviations = np.where(np.arange(200) % 2, 0.1, 1e-6)
     mesh = triangulate(dataclasses.replace(snapshot, relative_deviations=deviations), CONFIG)
-    np.testing.assert_allclose(np.unique(np.round(mesh.weight, 6)), [0.02 / np.hypot(0.1, 0.01), 2.0], rtol=1e-5)
+    np.testing.assert_allclose(np.unique(np.round(mesh.relative_deviation, 9)), [0.01, np.hypot(0.1, 0.01)], rtol=1e-5)
 
 
 def test_useless_landmarks_are_left_out(snapshot):
     depths, deviations = snapshot.depths.copy(), snapshot.relative_deviations.copy()
     depths[:3], deviations[3] = [np.nan, -1.0, 0.0], np.nan
     mesh = triangulate(dataclasses.replace(snapshot, depths=depths, relative_deviations=deviations), CONFIG)
-    assert np.isfinite(mesh.inverse_depth).all() and (mesh.inverse_depth > 0).all() and np.isfinite(mesh.weight).all()
+    assert np.isfinite(mesh.inverse_depth).all() and (mesh.inverse_depth > 0).all() and np.isfinite(mesh.relative_deviation).all()
 
 
 def test_too_few_landmarks_make_no_mesh(snapshot):

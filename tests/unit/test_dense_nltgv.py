@@ -52,8 +52,10 @@ def test_a_lone_outlier_is_pulled_to_its_plane():
     inside = int(np.argmin(np.linalg.norm(mesh.pixels - [64, 48], axis=1)))
     spoilt = mesh.inverse_depth.copy()
     spoilt[inside] *= 1.3
-    weight = np.ones(len(spoilt))
-    result = denoise(dataclasses.replace(mesh, inverse_depth=spoilt, weight=weight), NltgvConfig(iterations=2000, data_weight=1.0))
+    deviation = np.full(len(spoilt), NltgvConfig().full_deviation)
+    result = denoise(
+        dataclasses.replace(mesh, inverse_depth=spoilt, relative_deviation=deviation), NltgvConfig(iterations=2000, data_weight=1.0)
+    )
     np.testing.assert_allclose(result.mesh.inverse_depth, mesh.inverse_depth, rtol=2e-3)
 
 
@@ -69,7 +71,7 @@ def test_a_depth_step_survives():
 def test_noise_falls_and_certain_vertices_lead():
     mesh = plane(400)
     deviations = np.where(np.arange(len(mesh.pixels)) % 4 == 0, 0.002, 0.05)
-    measured = dataclasses.replace(noisy(mesh, 1.0 * deviations), weight=0.02 / deviations)
+    measured = dataclasses.replace(noisy(mesh, 1.0 * deviations), relative_deviation=deviations)
     result = denoise(measured, NltgvConfig())
     error_before = np.abs(measured.inverse_depth / mesh.inverse_depth - 1).mean()
     error_after = np.abs(result.mesh.inverse_depth / mesh.inverse_depth - 1).mean()

@@ -9,7 +9,7 @@ from vitamin3d.types import Array, ImageMesh, MapSnapshot
 
 
 def triangulate(snapshot: MapSnapshot, config: DelaunayConfig) -> ImageMesh | None:
-    """Delaunay triangulation of the snapshot's ideal pixels, with the inverse depth and data weight of each vertex.
+    """Delaunay triangulation of the snapshot's ideal pixels, with the inverse depth and the deviation of each vertex.
 
     Returns:
         None where fewer than `min_vertices` usable landmarks are left, or all of them lie on a line.
@@ -24,8 +24,8 @@ def triangulate(snapshot: MapSnapshot, config: DelaunayConfig) -> ImageMesh | No
         triangles = Delaunay(pixels).simplices.astype(np.int32)
     except QhullError:
         return None
-    weight = config.weight_scale / np.hypot(snapshot.relative_deviations[chosen], config.deviation_floor)
-    return ImageMesh(pixels, triangles, unique_edges(triangles), 1.0 / snapshot.depths[chosen], weight)
+    deviation = np.hypot(snapshot.relative_deviations[chosen], config.deviation_floor)
+    return ImageMesh(pixels, triangles, unique_edges(triangles), 1.0 / snapshot.depths[chosen], deviation)
 
 
 def unique_edges(triangles: Array) -> Array:

@@ -19,22 +19,33 @@ class DepthRenderer:
         self.canvas = camera.canvas(config.canvas_limit)
         self._maps = camera.canvas_maps(self.canvas)
         white = np.full((camera.height, camera.width), 255, np.uint8)
-        self._is_outside = camera.draw_on_canvas(white, self._maps) < 255
+        self.is_outside = camera.draw_on_canvas(white, self._maps) < 255
+
+    def draw_gray(self, frame: Frame) -> Array:
+        """(H, W) uint8 picture on the canvas; meaningless where `is_outside`."""
+        return self.camera.draw_on_canvas(frame.image, self._maps)
 
     def render(self, snapshot: MapSnapshot, mesh: ImageMesh, slopes: Array) -> DepthView:
         """Depth, normals and colour of a keyframe; `slopes` (V, 2) is the gradient of inverse depth at the vertices."""
         kept = mesh.triangles[is_surface(mesh, self.camera, self.config)]
         shift = np.array([self.canvas.cx - self.camera.cx, self.canvas.cy - self.camera.cy])
-        layers = np.column_stack([mesh.inverse_depth, slopes])
+        layers = np.column_stack([mesh.inverse_depth, slopes, mesh.relative_deviation])
         drawn = rasterize(mesh.pixels + shift, kept, layers, self.canvas.width, self.canvas.height)
-        drawn[self._is_outside] = 0.0
-        depth, normals = depth_and_normals(drawn, self.canvas)
-        return DepthView(snapshot.frame.timestamp_ns, snapshot.T_cam_world, depth, normals, self._draw_color(snapshot.frame))
+        drawn[self.is_outside] = 0.0
+        depth, normals = depth_and_normals(drawn[..., :3], self.canvas)
+        weights = inverse_variances(depth, drawn[..., 3])
+        return DepthView(snapshot.frame.timestamp_ns, snapshot.T_cam_world, depth, normals, self._draw_color(snapshot.frame), weights)
 
     def _draw_color(self, frame: Frame) -> Array:
         image = frame.image if frame.color is None else frame.color
         drawn = self.camera.draw_on_canvas(image, self._maps)
         return drawn if drawn.ndim == 3 else np.asarray(cv2.cvtColor(drawn, cv2.COLOR_GRAY2RGB))
+
+
+def inverse_variances(depth: Array, relative_deviations: Array) -> Array:
+    """(H, W) float32 `1 / (depth * relative deviation)²`, per squared map unit; 0 where there is no depth."""
+    deviations = depth * relative_deviations
+    return np.asarray(np.divide(1.0, deviations**2, out=np.zeros(depth.shape), where=deviations > 0), np.float32)
 
 
 def is_surface(mesh: ImageMesh, camera: Camera, config: DepthRenderingConfig) -> Array:

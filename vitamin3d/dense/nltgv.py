@@ -70,7 +70,9 @@ def normalized_problem(mesh: ImageMesh, config: NltgvConfig) -> NltgvProblem:
     pixels = mesh.pixels / config.pixel_unit
     i, j = mesh.edges[:, 0], mesh.edges[:, 1]
     data = mesh.inverse_depth / mesh.inverse_depth.mean()
-    return NltgvProblem(mesh.edges, pixels[i] - pixels[j], data, config.data_weight * mesh.weight, config.slope_weight)
+    return NltgvProblem(
+        mesh.edges, pixels[i] - pixels[j], data, config.data_weight * config.full_deviation / mesh.relative_deviation, config.slope_weight
+    )
 
 
 def objective(problem: NltgvProblem, state: Array) -> float:

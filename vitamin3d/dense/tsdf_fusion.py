@@ -6,6 +6,7 @@ from typing import Any, Protocol
 
 import numpy as np
 
+from vitamin3d.dense.block_volume import BlockVolume
 from vitamin3d.errors import DependencyError, InputError
 from vitamin3d.geometry.camera import Camera
 from vitamin3d.types import Array, DepthView, Surface
@@ -20,19 +21,21 @@ class TsdfVolume:
     Args:
         voxel_length: map units.
         truncation: map units; distances are kept up to this far from a surface.
-        backend: `scalable` (Open3D's ScalableTSDFVolume) or `voxel_block_grid` (its tensor twin).
+        max_deviation: map units; the surface ends where the views together know it worse than this (`blocks` alone).
+        backend: `blocks` (ours; every pixel has its weight), `scalable` (Open3D's ScalableTSDFVolume) or `voxel_block_grid`
+            (its tensor twin), where all pixels weigh the same.
 
     Raises:
         InputError: no such backend.
         DependencyError: the installed Open3D fuses nothing.
     """
 
-    def __init__(self, voxel_length: float, truncation: float, backend: str = "scalable") -> None:
+    def __init__(self, voxel_length: float, truncation: float, max_deviation: float, backend: str = "blocks") -> None:
         if backend not in BACKENDS:
             raise InputError(f"fusion.backend must be one of {', '.join(BACKENDS)}, not {backend!r}")
         check_backend(backend)
         self.voxel_length = voxel_length
-        self._volume = BACKENDS[backend](voxel_length, truncation)
+        self._volume = BACKENDS[backend](voxel_length, truncation, max_deviation)
 
     def integrate(self, view: DepthView, canvas: Camera, max_depth: float) -> None:
         """Averages a view, drawn on `canvas`, into the volume; depths beyond `max_depth` (map units) are left out."""
@@ -45,7 +48,7 @@ class TsdfVolume:
 
 
 class _Backend(Protocol):
-    def __init__(self, voxel_length: float, truncation: float) -> None: ...
+    def __init__(self, voxel_length: float, truncation: float, max_deviation: float) -> None: ...
 
     def integrate(self, view: DepthView, canvas: Camera, max_depth: float) -> None: ...
 
@@ -55,7 +58,7 @@ class _Backend(Protocol):
 class _ScalableVolume:
     """Open3D's ScalableTSDFVolume."""
 
-    def __init__(self, voxel_length: float, truncation: float) -> None:
+    def __init__(self, voxel_length: float, truncation: float, max_deviation: float) -> None:
         import open3d as o3d
 
         self._volume = o3d.pipelines.integration.ScalableTSDFVolume(
@@ -87,7 +90,7 @@ class _ScalableVolume:
 class _VoxelBlockGrid:
     """Open3D's tensor VoxelBlockGrid on the CPU (its `ray_cast` crashes at random and is never called)."""
 
-    def __init__(self, voxel_length: float, truncation: float) -> None:
+    def __init__(self, voxel_length: float, truncation: float, max_deviation: float) -> None:
         import open3d as o3d
 
         self._truncation_voxels = truncation / voxel_length
@@ -120,7 +123,20 @@ class _VoxelBlockGrid:
         return _surface(mesh.vertex.positions.numpy(), mesh.triangle.indices.numpy(), mesh.vertex.colors.numpy())
 
 
-BACKENDS: dict[str, type[_Backend]] = {"scalable": _ScalableVolume, "voxel_block_grid": _VoxelBlockGrid}
+class _WeightedBlocks:
+    """Our blocks of voxels."""
+
+    def __init__(self, voxel_length: float, truncation: float, max_deviation: float) -> None:
+        self._volume = BlockVolume(voxel_length, truncation, max_deviation)
+
+    def integrate(self, view: DepthView, canvas: Camera, max_depth: float) -> None:
+        self._volume.integrate(view, canvas, max_depth)
+
+    def extract_surface(self) -> Surface:
+        return _surface(*self._volume.extract())
+
+
+BACKENDS: dict[str, type[_Backend]] = {"blocks": _WeightedBlocks, "scalable": _ScalableVolume, "voxel_block_grid": _VoxelBlockGrid}
 
 
 def empty_surface() -> Surface:
@@ -144,8 +160,8 @@ def check_backend(backend: str) -> None:
     """
     canvas = Camera(40.0, 40.0, 19.5, 19.5, 40, 40)
     depth, normals, color = np.ones((40, 40), np.float32), np.zeros((40, 40, 3), np.float32), np.full((40, 40, 3), 128, np.uint8)
-    volume = BACKENDS[backend](0.04, 0.16)
-    volume.integrate(DepthView(0, np.eye(4), depth, normals, color), canvas, 2.0)
+    volume = BACKENDS[backend](0.04, 0.16, 10.0)
+    volume.integrate(DepthView(0, np.eye(4), depth, normals, color, np.ones_like(depth)), canvas, 2.0)
     if not _is_plane_at_one(volume.extract_surface().vertices_world):
         import open3d as o3d
 

@@ -1,0 +1,270 @@
+# SPDX-License-Identifier: Apache-2.0
+"""More vertices than landmarks: depths of textured pixels, from a keyframe and its neighbours.
+
+A sweep over planes on the reduced pictures says where a pixel of each cell lies; where it says so distinctly, patches of
+the full pictures refine it along the epipolar lines. What is found joins the landmarks as vertices of the mesh, each with
+the deviation that its parallax leaves.
+"""
+
+from dataclasses import dataclass, replace
+
+import cv2
+import numpy as np
+
+from vitamin3d._jit import kernel
+from vitamin3d.config import DensificationConfig
+from vitamin3d.dense.plane_sweep import PlaneSweep, SweptDepth, turned
+from vitamin3d.geometry.camera import Camera
+from vitamin3d.geometry.se3 import inverse
+from vitamin3d.types import Array, MapSnapshot
+
+REDUCTION = 2
+REFINEMENT_STEPS, REFINEMENT_STEP_PX = 4, 0.7
+"""The patches are compared at so many steps to each side of the swept depth."""
+MIN_PATCH_DEVIATION = 2.0
+"""Grey levels; flatter patches are not compared."""
+
+
+@dataclass(frozen=True)
+class CanvasPicture:
+    """A keyframe ready to be compared with others."""
+
+    snapshot: MapSnapshot
+    image: Array
+    """(H, W) uint8 on the canvas, 0 = no picture."""
+    reduced: Array
+    """(H / 2, W / 2) uint8."""
+
+
+@dataclass(frozen=True)
+class Neighbourhood:
+    """A keyframe and those around it."""
+
+    picture: CanvasPicture
+    before: list[CanvasPicture]
+    """Earlier ones, the nearest first."""
+    after: list[CanvasPicture]
+    """Later ones, the nearest first."""
+
+
+def canvas_picture(snapshot: MapSnapshot, image: Array, is_outside: Array) -> CanvasPicture:
+    """A keyframe with its picture (H, W) on the canvas; `is_outside` (H, W) bool says where there is none."""
+    image = np.where(is_outside, np.uint8(0), np.maximum(image, np.uint8(1)))
+    height, width = (n // REDUCTION * REDUCTION for n in image.shape)
+    reduced = cv2.resize(image[:height, :width], (width // REDUCTION, height // REDUCTION), interpolation=cv2.INTER_AREA)
+    outside = is_outside[:height, :width].reshape(height // REDUCTION, REDUCTION, width // REDUCTION, REDUCTION).any(axis=(1, 3))
+    return CanvasPicture(snapshot, image, np.where(outside, np.uint8(0), np.maximum(reduced, np.uint8(1))))
+
+
+@kernel
+def _refine(image, sources, motions, intrinsics, pixels, start, step, steps, radius, refined, score):  # type: ignore[no-untyped-def]
+    """Inverse depth (N,) where patches agree best: mean ZNCC of the two best sources; NaN where that is at an end or flat."""
+    height, width = image.shape
+    fx, fy, cx, cy = intrinsics
+    size = (2 * radius + 1) ** 2
+    patch, other = np.empty(size, np.float32), np.empty(size, np.float32)
+    scores = np.empty(2 * steps + 1, np.float32)
+    for n in range(pixels.shape[0]):
+        refined[n], score[n] = np.nan, 0.0
+        u, v = pixels[n, 0], pixels[n, 1]
+        if u < radius or v < radius or u >= width - radius or v >= height - radius:
+            continue
+        i, mean = 0, np.float32(0.0)
+        for y in range(-radius, radius + 1):
+            for x in range(-radius, radius + 1):
+                patch[i] = image[v + y, u + x]
+                mean += patch[i]
+                i += 1
+        mean /= np.float32(size)
+        power = np.float32(0.0)
+        for i in range(size):
+            patch[i] -= mean
+            power += patch[i] * patch[i]
+        if power < size * MIN_PATCH_DEVIATION**2:
+            continue
+        for k in range(2 * steps + 1):
+            xi = start[n] + (k - steps) * step[n]
+            best, second = np.float32(-1.0), np.float32(-1.0)
+            for s in range(sources.shape[0]):
+                z = 1.0 + xi * motions[s, 2]
+                if z <= 0.1:
+                    continue
+                a = (u - cx + xi * motions[s, 0] * fx) / z + cx
+                b = (v - cy + xi * motions[s, 1] * fy) / z + cy
+                left, top = int(np.floor(a)), int(np.floor(b))
+                if left < radius or top < radius or left >= width - radius - 1 or top >= height - radius - 1:
+                    continue
+                p, q = np.float32(a - left), np.float32(b - top)
+                one = np.float32(1.0)
+                w00, w01, w10, w11 = (one - p) * (one - q), p * (one - q), (one - p) * q, p * q
+                i, mean = 0, np.float32(0.0)
+                for y in range(-radius, radius + 1):
+                    for x in range(-radius, radius + 1):
+                        r, c = top + y, left + x
+                        other[i] = (
+                            w00 * sources[s, r, c]
+                            + w01 * sources[s, r, c + 1]
+                            + w10 * sources[s, r + 1, c]
+                            + w11 * sources[s, r + 1, c + 1]
+                        )
+                        mean += other[i]
+                        i += 1
+                mean /= np.float32(size)
+                product, other_power = np.float32(0.0), np.float32(1e-3)
+                for i in range(size):
+                    t = other[i] - mean
+                    product += patch[i] * t
+                    other_power += t * t
+                zncc = product / np.sqrt(power * other_power)
+                second = max(second, min(best, zncc))
+                best = max(best, zncc)
+            scores[k] = np.float32(0.5) * (best + second)
+        k = 0
+        for m in range(2 * steps + 1):
+            if scores[m] > scores[k]:
+                k = m
+        if 0 < k < 2 * steps:
+            bend = 2.0 * scores[k] - scores[k - 1] - scores[k + 1]
+            if bend > 0.0:
+                refined[n] = start[n] + (k - steps + 0.5 * (scores[k + 1] - scores[k - 1]) / bend) * step[n]
+                score[n] = scores[k]
+
+
+class Densifier:
+    """Adds vertices to keyframes of one camera.
+
+    Args:
+        camera: of the snapshots' ideal pixels.
+        canvas: of the pictures.
+    """
+
+    def __init__(self, camera: Camera, canvas: Camera, config: DensificationConfig) -> None:
+        self.camera, self.canvas, self.config = camera, canvas, config
+        half = 0.5 / REDUCTION - 0.5
+        self.reduced = Camera(
+            canvas.fx / REDUCTION, canvas.fy / REDUCTION, canvas.cx / REDUCTION + half, canvas.cy / REDUCTION + half,
+            canvas.width // REDUCTION, canvas.height // REDUCTION,
+        )  # fmt: skip
+        self._sweep: PlaneSweep | None = None
+
+    def densify(self, around: Neighbourhood) -> MapSnapshot:
+        """The snapshot with more vertices, or as it was where it has few landmarks or too few neighbours with parallax."""
+        picture, snapshot = around.picture, around.picture.snapshot
+        if len(snapshot.depths) < self.config.min_landmarks:
+            return snapshot
+        sources = [*self._chosen(snapshot, around.before), *self._chosen(snapshot, around.after)]
+        if len(sources) < 2:
+            return snapshot
+        T_source_reference = np.stack([s.snapshot.T_cam_world @ inverse(snapshot.T_cam_world) for s in sources])
+        rotations, translations = T_source_reference[:, :3, :3], T_source_reference[:, :3, 3]
+        motions = np.einsum("nji,nj->ni", rotations, translations)
+        small = [turned(s.reduced, self.reduced, R) for s, R in zip(sources, rotations, strict=True)]
+        self._sweep = self._sweep or PlaneSweep(self.reduced, self.config)
+        swept = self._sweep.depths(picture.reduced, small, motions, self._planes(snapshot))
+        rows, columns = self._distinct(swept, self._planes(snapshot))
+        full = np.stack([turned(s.image, self.canvas, R) for s, R in zip(sources, rotations, strict=True)]).astype(np.float32)
+        pixels = REDUCTION * np.stack([columns, rows], axis=1).astype(np.int64)
+        return self._joined(snapshot, *self._refined(picture, full, motions, pixels, swept.inverse_depth[rows, columns]))
+
+    def _chosen(self, snapshot: MapSnapshot, neighbours: list[CanvasPicture]) -> list[CanvasPicture]:
+        """Of the neighbours that see the same place, the ones with the parallaxes asked for."""
+        config = self.config
+        points = self.camera.rays_from_ideal(snapshot.pixels) * snapshot.depths[:, None]
+        seen = [(n, *self._parallax_and_overlap(points, snapshot, n)) for n in neighbours]
+        candidates = [(n, parallax) for n, parallax, overlap in seen if overlap >= config.min_overlap and parallax > 0.0]
+        chosen = []
+        for wanted in (config.near_parallax_deg, config.far_parallax_deg):
+            if candidates:
+                best = int(np.argmin([abs(np.log(parallax / wanted)) for _, parallax in candidates]))
+                chosen.append(candidates.pop(best)[0])
+        return chosen
+
+    def _parallax_and_overlap(self, points: Array, snapshot: MapSnapshot, other: CanvasPicture) -> tuple[float, float]:
+        """Median angle (degrees) at the points (N, 3) between two cameras, and the share of them that the other sees."""
+        T = other.snapshot.T_cam_world @ inverse(snapshot.T_cam_world)
+        there = points @ T[:3, :3].T + T[:3, 3]
+        with np.errstate(invalid="ignore"):
+            overlap = self.canvas.is_inside(self.canvas.ideal_from_points(there)).mean()
+        rays = points + T[:3, :3].T @ T[:3, 3]
+        cosines = (points * rays).sum(axis=1) / (np.linalg.norm(points, axis=1) * np.linalg.norm(rays, axis=1))
+        return float(np.degrees(np.arccos(np.clip(np.median(cosines), -1.0, 1.0)))), float(overlap)
+
+    def _planes(self, snapshot: MapSnapshot) -> Array:
+        """(D,) inverse depths around those of the landmarks."""
+        low, high = np.quantile(1.0 / snapshot.depths, [0.02, 0.98])
+        return np.linspace(0.6 * low, 1.3 * high, self.config.planes)
+
+    def _distinct(self, swept: SweptDepth, planes: Array) -> tuple[Array, Array]:
+        """Rows and columns (N,) of the most distinct pixel of each cell, where it is distinct, cheap and like its neighbours."""
+        config, cell = self.config, self.config.cell_px // REDUCTION
+        quality = np.where((swept.inverse_depth > 0) & (swept.cost < config.max_cost), swept.distinctness, 0.0)
+        for axis, by in ((0, 2), (0, -2), (1, 2), (1, -2)):
+            difference = np.abs(swept.inverse_depth - np.roll(swept.inverse_depth, by, axis))
+            quality[difference > 2.0 * (planes[1] - planes[0])] = 0.0
+        height, width = (n // cell for n in quality.shape)
+        cells = quality[: height * cell, : width * cell].reshape(height, cell, width, cell).transpose(0, 2, 1, 3).reshape(height, width, -1)
+        best = cells.argmax(axis=2)
+        rows, columns = np.nonzero(cells.max(axis=2) > config.min_distinctness)
+        at = best[rows, columns]
+        return rows * cell + at // cell, columns * cell + at % cell
+
+    def _refined(
+        self, picture: CanvasPicture, sources: Array, motions: Array, pixels: Array, inverse_depths: Array
+    ) -> tuple[Array, Array, Array]:
+        """Canvas pixels (N, 2), inverse depths (N,) and relative deviations (N,) of those whose patches agree."""
+        config = self.config
+        rates = self._pixels_per_relative_depth(pixels, inverse_depths, motions)
+        step = REFINEMENT_STEP_PX * inverse_depths / np.maximum(rates.max(axis=1), 1e-3)
+        refined, score = np.empty(len(pixels)), np.empty(len(pixels))
+        _refine(
+            picture.image.astype(np.float32), sources, motions, self.canvas.intrinsics, pixels, inverse_depths, step,
+            REFINEMENT_STEPS, config.patch_px // 2, refined, score,
+        )  # fmt: skip
+        deviations = config.sigma_px / np.maximum(np.sqrt((np.sort(rates, axis=1)[:, -3:] ** 2).sum(axis=1)), 1e-3)
+        good = np.isfinite(refined) & (refined > 0) & (score > config.min_zncc) & (deviations < config.max_relative_deviation)
+        return pixels[good].astype(np.float64), refined[good], deviations[good]
+
+    def _pixels_per_relative_depth(self, pixels: Array, inverse_depths: Array, motions: Array) -> Array:
+        """(N, S) by how many pixels a point moves in each source when its inverse depth grows by its own size."""
+        x, y, _ = self.canvas.rays_from_ideal(pixels).T
+        u = self.canvas.fx * (motions[None, :, 0] - x[:, None] * motions[None, :, 2])
+        v = self.canvas.fy * (motions[None, :, 1] - y[:, None] * motions[None, :, 2])
+        return np.asarray(inverse_depths[:, None] * np.hypot(u, v) / (1.0 + inverse_depths[:, None] * motions[None, :, 2]) ** 2)
+
+    def _joined(self, snapshot: MapSnapshot, pixels: Array, inverse_depths: Array, deviations: Array) -> MapSnapshot:
+        shift = np.array([self.canvas.cx - self.camera.cx, self.canvas.cy - self.camera.cy])
+        return replace(
+            snapshot,
+            pixels=np.concatenate([snapshot.pixels, pixels - shift]),
+            depths=np.concatenate([snapshot.depths, 1.0 / inverse_depths]),
+            relative_deviations=np.concatenate([snapshot.relative_deviations, deviations]),
+        )
+
+
+class KeyframeQueue:
+    """Lets keyframes wait until those that come after them are there too; every `stride`-th comes out, with its neighbours."""
+
+    def __init__(self, reach: int, stride: int) -> None:
+        self._reach, self._stride = reach, stride
+        self._pictures: list[CanvasPicture] = []
+        self._first, self._next = 0, 0
+
+    def push(self, picture: CanvasPicture) -> list[Neighbourhood]:
+        """Adds a keyframe, in the order of time; those that are ready."""
+        self._pictures.append(picture)
+        return self._taken(self._first + len(self._pictures) - self._reach)
+
+    def flush(self) -> list[Neighbourhood]:
+        """Those that still wait: none will follow."""
+        return self._taken(self._first + len(self._pictures))
+
+    def _taken(self, end: int) -> list[Neighbourhood]:
+        ready = []
+        while self._next < end:
+            at = self._next - self._first
+            before, after = self._pictures[max(0, at - self._reach) : at][::-1], self._pictures[at + 1 : at + 1 + self._reach]
+            ready.append(Neighbourhood(self._pictures[at], before, after))
+            self._next += self._stride
+            stale = min(max(0, self._next - self._reach - self._first), len(self._pictures))
+            self._pictures, self._first = self._pictures[stale:], self._first + stale
+        return ready
