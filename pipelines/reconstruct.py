@@ -20,7 +20,6 @@ def main(argv: list[str] | None = None) -> int:
 
     front_end = FrontEnd(config)  # curvature, its extrema, and the flow between two pictures
     slam = Slam(dataset.camera, config)  # tracks the extrema, localises the camera, maps the landmarks
-    reconstruction = Reconstruction(dataset.camera, config)  # meshes, denoises and fuses the keyframes
 
     for index in range(len(dataset)):
         frame = dataset.read(index)
@@ -33,6 +32,7 @@ def main(argv: list[str] | None = None) -> int:
         return 3
     slam.finish()  # adjusts the whole map once more
 
+    reconstruction = Reconstruction(slam.camera, config)  # meshes, denoises and fuses the keyframes
     for keyframe, index in enumerate(slam.map.frame_indices):
         frame = dataset.read(index)
         if not isinstance(frame, Unreadable):
@@ -40,7 +40,7 @@ def main(argv: list[str] | None = None) -> int:
 
     output.write_config(config)
     output.write_trajectories(slam.trajectory(), slam.keyframe_trajectory(), scale)
-    output.write_cloud(point_cloud(slam.map, dataset.camera, config.cloud, config.snapshot.observation_sigma_px), scale, "")
+    output.write_cloud(point_cloud(slam.map, slam.camera, config.cloud, config.snapshot.observation_sigma_px), scale, "")
     output.write_surfaces(*reconstruction.surfaces(), scale, reconstruction.voxel_lengths())
     print(f"{len(slam.trajectory())} of {len(dataset)} frames localised, {slam.map.num_keyframes} keyframes: {output.path}")
     return 0

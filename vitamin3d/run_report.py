@@ -150,14 +150,15 @@ def _tracked_extrema(dataset: Dataset, slam: Slam, keyframe: int) -> Picture | N
 
 
 def _normal_maps(folder: Path, stamps: list[str]) -> list[Picture]:
-    pictures = []
-    for stamp in stamps:
-        path = folder / f"{stamp}.png"
+    """The normal maps nearest in time: not every keyframe has one."""
+    pictures, there = [], sorted(folder.glob("*.png")) if folder.is_dir() else []
+    for stamp in stamps if there else []:
+        path = min(there, key=lambda p: abs(float(p.stem) - float(stamp)))
         pixels = cv2.imdecode(np.frombuffer(path.read_bytes(), np.uint8), cv2.IMREAD_COLOR) if path.is_file() else None
         if pixels is not None:
             height = round(pixels.shape[0] * PICTURE_WIDTH / pixels.shape[1])
             small = cv2.resize(pixels, (PICTURE_WIDTH, height), interpolation=cv2.INTER_AREA)
-            pictures.append(Picture(f"{stamp} s", jpeg(np.asarray(cv2.cvtColor(small, cv2.COLOR_BGR2RGB)), 80)))
+            pictures.append(Picture(f"{path.stem} s", jpeg(np.asarray(cv2.cvtColor(small, cv2.COLOR_BGR2RGB)), 80)))
     return pictures
 
 

@@ -198,10 +198,10 @@ class PlaneSweep:
         """
         camera, signatures = self.camera, np.stack([census(source) for source in sources])
         with np.errstate(divide="ignore", over="ignore"):
-            scale = 1.0 / np.maximum(1.0 + motions[:, 2:] * inverse_depths, 1e-6)
-        shift_u = camera.fx * motions[:, :1] * inverse_depths * scale + camera.cx + 0.5
-        shift_v = camera.fy * motions[:, 1:2] * inverse_depths * scale + camera.cy + 0.5
-        scale, shift_u, shift_v = (np.clip(table, -1e9, 1e9).astype(np.float32) for table in (scale, shift_u, shift_v))
+            exact = 1.0 / np.maximum(1.0 + motions[:, 2:] * inverse_depths, 1e-6)
+        moved_u = camera.fx * motions[:, :1] * inverse_depths * exact + camera.cx + 0.5
+        moved_v = camera.fy * motions[:, 1:2] * inverse_depths * exact + camera.cy + 0.5
+        scale, shift_u, shift_v = (np.clip(table, -1e9, 1e9).astype(np.float32) for table in (exact, moved_u, moved_v))
         _sweep(census(image), signatures, scale, shift_u, shift_v, np.array([camera.cx, camera.cy], np.float32), self._cost)
         config = self.config
         _aggregate(self._cost, image, np.float32(config.small_penalty), np.float32(config.edge_penalty), self._total)
