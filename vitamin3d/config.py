@@ -33,6 +33,8 @@ AT_LEAST_ONE = (
     "window.keyframes",
     "densification.keyframe_stride",
     "densification.reach",
+    "consistency.near",
+    "consistency.far",
 )
 
 
@@ -345,6 +347,20 @@ class DepthRenderingConfig:
 
 
 @dataclass(frozen=True)
+class ConsistencyConfig:
+    """Before fusion, a depth that none of the views around it confirms loses weight."""
+
+    enabled: bool = True
+    near: int = 2
+    """The other views are the ones so many before and after in the order of fusion,"""
+    far: int = 5
+    """and so many."""
+    tolerance: float = 0.03
+    """Relative difference of depth up to which a view confirms."""
+    lonely_weight: float = 0.1
+
+
+@dataclass(frozen=True)
 class FusionConfig:
     """Sec. 4.2: the two TSDF volumes."""
 
@@ -358,8 +374,8 @@ class FusionConfig:
     depth_per_voxel_high: float = 120.0
     keyframes_for_depth: int = 30
     """Keyframes whose depths decide the voxels; fusion waits for them where the voxels are not given."""
-    truncation_voxels: float = 4.0
-    max_deviation_voxels: float = 5.0
+    truncation_voxels: float = 3.0
+    max_deviation_voxels: float = 4.0
     """The surface ends where all views together leave a larger deviation of the depth (`blocks` alone)."""
     max_depth: float = 3.0
     """Depth beyond this many median depths of the scene is not fused."""
@@ -399,6 +415,7 @@ class Config:
     delaunay: DelaunayConfig = field(default_factory=DelaunayConfig)
     nltgv: NltgvConfig = field(default_factory=NltgvConfig)
     depth_rendering: DepthRenderingConfig = field(default_factory=DepthRenderingConfig)
+    consistency: ConsistencyConfig = field(default_factory=ConsistencyConfig)
     fusion: FusionConfig = field(default_factory=FusionConfig)
     surface: SurfaceConfig = field(default_factory=SurfaceConfig)
 
@@ -415,6 +432,7 @@ def paper_config() -> Config:
         window=WindowConfig(anchors=0),
         final_adjustment=FinalAdjustmentConfig(enabled=False),
         densification=DensificationConfig(enabled=False),
+        consistency=ConsistencyConfig(enabled=False),
         calibration=CalibrationConfig(refine="off"),
         bundle_adjustment=BundleAdjustmentConfig(keyframe_solver="subspace", keyframe_iterations=20),
     )

@@ -10,9 +10,11 @@ from dataclasses import replace
 import numpy as np
 
 from vitamin3d.config import Config
+from vitamin3d.dense.consistency import doubted
 from vitamin3d.dense.delaunay import triangulate
-from vitamin3d.dense.densification import CanvasPicture, Densifier, KeyframeQueue, Neighbourhood, canvas_picture
+from vitamin3d.dense.densification import CanvasPicture, Densifier, canvas_picture
 from vitamin3d.dense.depth_rendering import DepthRenderer
+from vitamin3d.dense.neighbour_queue import Around, NeighbourQueue
 from vitamin3d.dense.nltgv import denoise
 from vitamin3d.dense.surface_extraction import clean
 from vitamin3d.dense.tsdf_fusion import TsdfVolume, empty_surface
@@ -39,7 +41,8 @@ class Reconstruction:
         self.renderer = DepthRenderer(camera, config.depth_rendering)
         densification = config.densification
         self._densifier = Densifier(camera, self.renderer.canvas, densification)
-        self._queue = KeyframeQueue(densification.reach, densification.keyframe_stride)
+        self._keyframes: NeighbourQueue[CanvasPicture] = NeighbourQueue(densification.reach, densification.keyframe_stride)
+        self._drawn: NeighbourQueue[DepthView] = NeighbourQueue(config.consistency.far if config.consistency.enabled else 0, 1)
         self.median_depths: list[float] = []
         self._waiting: list[DepthView] = []
         self.low: TsdfVolume | None = None
@@ -52,23 +55,17 @@ class Reconstruction:
 
     def add_keyframe(self, snapshot: MapSnapshot) -> list[DepthView]:
         """Takes a keyframe, in the order of time, and fuses those that have all their neighbours by now; their views."""
-        return self._fused(self._depth_views(self._ready(snapshot)))
+        return self._fused(self._views(self._ready(snapshot)))
 
     def finish(self) -> list[DepthView]:
         """Fuses the keyframes that waited for neighbours; their views."""
-        return self._fused(self._depth_views(self._queue.flush()))
+        return self._fused(self._last_views())
 
     def depth_views(self, snapshots: Iterable[MapSnapshot]) -> Iterator[DepthView]:
         """The views of a whole sequence of keyframes, not fused yet; those with too few landmarks have none."""
         for snapshot in snapshots:
-            yield from self._depth_views(self._ready(snapshot))
-        yield from self._depth_views(self._queue.flush())
-
-    def _ready(self, snapshot: MapSnapshot) -> list[Neighbourhood]:
-        if not self.config.densification.enabled:
-            return [Neighbourhood(CanvasPicture(snapshot, NO_PICTURE, NO_PICTURE), [], [])]
-        image, outside = self.renderer.draw_gray(snapshot.frame), self.renderer.is_outside
-        return self._queue.push(canvas_picture(snapshot, image, outside))
+            yield from self._views(self._ready(snapshot))
+        yield from self._last_views()
 
     def _fused(self, views: Iterator[DepthView]) -> list[DepthView]:
         done = []
@@ -77,15 +74,33 @@ class Reconstruction:
             done.append(view)
         return done
 
-    def _depth_views(self, ready: list[Neighbourhood]) -> Iterator[DepthView]:
-        for neighbourhood in ready:
-            snapshot = neighbourhood.picture.snapshot
+    def _ready(self, snapshot: MapSnapshot) -> list[Around[CanvasPicture]]:
+        if not self.config.densification.enabled:
+            return [Around(CanvasPicture(snapshot, NO_PICTURE, NO_PICTURE), [], [])]
+        return self._keyframes.push(canvas_picture(snapshot, self.renderer.draw_gray(snapshot.frame), self.renderer.is_outside))
+
+    def _views(self, ready: list[Around[CanvasPicture]]) -> Iterator[DepthView]:
+        """Densifies and draws keyframes; each comes out when the views around it are there to confirm it."""
+        for around in ready:
+            snapshot = around.item.snapshot
             if self.config.densification.enabled:
                 with self._timed("densification"):
-                    snapshot = self._densifier.densify(neighbourhood)
+                    snapshot = self._densifier.densify(around)
             view = self.depth_view(snapshot)
             if view is not None:
-                yield view
+                yield from map(self._checked, self._drawn.push(view))
+
+    def _last_views(self) -> Iterator[DepthView]:
+        yield from self._views(self._keyframes.flush())
+        yield from map(self._checked, self._drawn.flush())
+
+    def _checked(self, around: Around[DepthView]) -> DepthView:
+        config = self.config.consistency
+        if not config.enabled:
+            return around.item
+        with self._timed("consistency"):
+            sides = (side[k - 1] for side in (around.before, around.after) for k in (config.near, config.far) if k <= len(side))
+            return doubted(around.item, list(sides), self.canvas, config.tolerance, config.lonely_weight)
 
     def depth_view(self, snapshot: MapSnapshot) -> DepthView | None:
         """Meshes, denoises and renders a keyframe; None where it has too few landmarks."""

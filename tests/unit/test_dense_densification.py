@@ -7,7 +7,8 @@ import pytest
 import reference_dense as reference
 
 from vitamin3d.config import Config, DelaunayConfig, DensificationConfig, SurfaceConfig
-from vitamin3d.dense.densification import CanvasPicture, Densifier, KeyframeQueue, Neighbourhood, canvas_picture
+from vitamin3d.dense.densification import Densifier, canvas_picture
+from vitamin3d.dense.neighbour_queue import Around, NeighbourQueue
 from vitamin3d.geometry.camera import Camera
 from vitamin3d.geometry.se3 import exp_se3, inverse
 from vitamin3d.reconstruction import Reconstruction
@@ -59,7 +60,7 @@ def true_depths(snapshot):
 
 def densified(**settings):
     pictures = scene()
-    around = Neighbourhood(pictures[3], pictures[2::-1], pictures[4:])
+    around = Around(pictures[3], pictures[2::-1], pictures[4:])
     return pictures[3].snapshot, Densifier(CAMERA, CAMERA, DensificationConfig(**settings)).densify(around)
 
 
@@ -84,11 +85,11 @@ def test_without_parallax_or_landmarks_the_keyframe_stays_as_it_was():
     pictures = scene(3, step=0.0)
     still = [dataclasses.replace(p, snapshot=dataclasses.replace(p.snapshot, T_cam_world=np.eye(4))) for p in pictures]
     densifier = Densifier(CAMERA, CAMERA, DensificationConfig())
-    assert densifier.densify(Neighbourhood(still[1], still[:1], still[2:])) is still[1].snapshot
+    assert densifier.densify(Around(still[1], still[:1], still[2:])) is still[1].snapshot
     moving = scene(3)
-    assert densifier.densify(Neighbourhood(moving[1], [], [])) is moving[1].snapshot
+    assert densifier.densify(Around(moving[1], [], [])) is moving[1].snapshot
     few = dataclasses.replace(moving[1], snapshot=picture_of_plane(np.eye(4), landmarks=5))
-    assert densifier.densify(Neighbourhood(few, moving[:1], moving[2:])) is few.snapshot
+    assert densifier.densify(Around(few, moving[:1], moving[2:])) is few.snapshot
 
 
 def test_refinement_finds_the_best_patch():
@@ -127,14 +128,11 @@ def test_the_border_of_the_canvas_is_no_picture():
     assert (picture.reduced[:6] == 0).all() and (picture.reduced[6:] > 0).all()
 
 
-@pytest.mark.parametrize(("reach", "stride", "count"), [(2, 1, 7), (3, 2, 8), (1, 5, 12), (4, 3, 3)])
+@pytest.mark.parametrize(("reach", "stride", "count"), [(2, 1, 7), (3, 2, 8), (1, 5, 12), (4, 3, 3), (0, 1, 4)])
 def test_the_queue_gives_each_its_neighbours(reach, stride, count):
-    queue, nothing = KeyframeQueue(reach, stride), np.zeros((0, 0), np.uint8)
-    ready = []
-    for k in range(count):
-        ready += queue.push(CanvasPicture(k, nothing, nothing))  # type: ignore[arg-type]
-    ready += queue.flush()
-    numbers = [(r.picture.snapshot, [p.snapshot for p in r.before], [p.snapshot for p in r.after]) for r in ready]
+    queue: NeighbourQueue[int] = NeighbourQueue(reach, stride)
+    ready = [around for k in range(count) for around in queue.push(k)] + queue.flush() + queue.flush()
+    numbers = [(r.item, r.before, r.after) for r in ready]
     expected = [
         (k, [j for j in range(k - 1, k - reach - 1, -1) if j >= 0], [j for j in range(k + 1, k + reach + 1) if j < count])
         for k in range(0, count, stride)

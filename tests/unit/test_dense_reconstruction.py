@@ -36,6 +36,7 @@ def snapshots(count=4, noise=0.01, landmarks=800, unit=1.0):
 def run(config=CONFIG, **scene):
     reconstruction = Reconstruction(reference.SMALL, config, StepTimes())
     views = [view for snapshot in snapshots(**scene) for view in reconstruction.add_keyframe(snapshot)]
+    views += reconstruction.finish()
     return reconstruction, views
 
 
@@ -57,7 +58,7 @@ def test_all_steps_are_timed():
     reconstruction, _ = run(count=2)
     reconstruction.surfaces()
     counts = {step: len(times) for step, times in reconstruction.times.milliseconds.items()}
-    each = dict.fromkeys(("meshing", "denoising", "rendering", "fusion_low", "fusion_high"), 2)
+    each = dict.fromkeys(("meshing", "denoising", "rendering", "consistency", "fusion_low", "fusion_high"), 2)
     assert counts == {**each, "surface_low": 1, "surface_high": 1}
 
 

@@ -13,6 +13,7 @@ import numpy as np
 
 from vitamin3d._jit import kernel
 from vitamin3d.config import DensificationConfig
+from vitamin3d.dense.neighbour_queue import Around
 from vitamin3d.dense.plane_sweep import PlaneSweep, SweptDepth, turned
 from vitamin3d.geometry.camera import Camera
 from vitamin3d.geometry.se3 import inverse
@@ -34,17 +35,6 @@ class CanvasPicture:
     """(H, W) uint8 on the canvas, 0 = no picture."""
     reduced: Array
     """(H / 2, W / 2) uint8."""
-
-
-@dataclass(frozen=True)
-class Neighbourhood:
-    """A keyframe and those around it."""
-
-    picture: CanvasPicture
-    before: list[CanvasPicture]
-    """Earlier ones, the nearest first."""
-    after: list[CanvasPicture]
-    """Later ones, the nearest first."""
 
 
 def canvas_picture(snapshot: MapSnapshot, image: Array, is_outside: Array) -> CanvasPicture:
@@ -147,9 +137,9 @@ class Densifier:
         )  # fmt: skip
         self._sweep: PlaneSweep | None = None
 
-    def densify(self, around: Neighbourhood) -> MapSnapshot:
+    def densify(self, around: Around[CanvasPicture]) -> MapSnapshot:
         """The snapshot with more vertices, or as it was where it has few landmarks or too few neighbours with parallax."""
-        picture, snapshot = around.picture, around.picture.snapshot
+        picture, snapshot = around.item, around.item.snapshot
         if len(snapshot.depths) < self.config.min_landmarks:
             return snapshot
         sources = [*self._chosen(snapshot, around.before), *self._chosen(snapshot, around.after)]
@@ -239,32 +229,3 @@ class Densifier:
             depths=np.concatenate([snapshot.depths, 1.0 / inverse_depths]),
             relative_deviations=np.concatenate([snapshot.relative_deviations, deviations]),
         )
-
-
-class KeyframeQueue:
-    """Lets keyframes wait until those that come after them are there too; every `stride`-th comes out, with its neighbours."""
-
-    def __init__(self, reach: int, stride: int) -> None:
-        self._reach, self._stride = reach, stride
-        self._pictures: list[CanvasPicture] = []
-        self._first, self._next = 0, 0
-
-    def push(self, picture: CanvasPicture) -> list[Neighbourhood]:
-        """Adds a keyframe, in the order of time; those that are ready."""
-        self._pictures.append(picture)
-        return self._taken(self._first + len(self._pictures) - self._reach)
-
-    def flush(self) -> list[Neighbourhood]:
-        """Those that still wait: none will follow."""
-        return self._taken(self._first + len(self._pictures))
-
-    def _taken(self, end: int) -> list[Neighbourhood]:
-        ready = []
-        while self._next < end:
-            at = self._next - self._first
-            before, after = self._pictures[max(0, at - self._reach) : at][::-1], self._pictures[at + 1 : at + 1 + self._reach]
-            ready.append(Neighbourhood(self._pictures[at], before, after))
-            self._next += self._stride
-            stale = min(max(0, self._next - self._reach - self._first), len(self._pictures))
-            self._pictures, self._first = self._pictures[stale:], self._first + stale
-        return ready
