@@ -348,7 +348,7 @@ class DepthRenderingConfig:
 
 @dataclass(frozen=True)
 class ConsistencyConfig:
-    """Before fusion, a depth that none of the views around it confirms loses weight."""
+    """Before fusion, a depth that the views around it contradict, and none confirms, loses weight."""
 
     enabled: bool = True
     near: int = 2
@@ -357,7 +357,8 @@ class ConsistencyConfig:
     """and so many."""
     tolerance: float = 0.03
     """Relative difference of depth up to which a view confirms."""
-    lonely_weight: float = 0.1
+    contradicted_weight: float = 0.1
+    """Factor."""
 
 
 @dataclass(frozen=True)
@@ -375,7 +376,7 @@ class FusionConfig:
     keyframes_for_depth: int = 30
     """Keyframes whose depths decide the voxels; fusion waits for them where the voxels are not given."""
     truncation_voxels: float = 3.0
-    max_deviation_voxels: float = 4.0
+    max_deviation_voxels: float = 4.5
     """The surface ends where all views together leave a larger deviation of the depth (`blocks` alone)."""
     max_depth: float = 3.0
     """Depth beyond this many median depths of the scene is not fused."""

@@ -100,7 +100,7 @@ class Reconstruction:
             return around.item
         with self._timed("consistency"):
             sides = (side[k - 1] for side in (around.before, around.after) for k in (config.near, config.far) if k <= len(side))
-            return doubted(around.item, list(sides), self.canvas, config.tolerance, config.lonely_weight)
+            return doubted(around.item, list(sides), self.canvas, config.tolerance, config.contradicted_weight)
 
     def depth_view(self, snapshot: MapSnapshot) -> DepthView | None:
         """Meshes, denoises and renders a keyframe; None where it has too few landmarks."""
