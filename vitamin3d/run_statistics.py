@@ -62,8 +62,7 @@ def calibration_table(camera: Camera, refinement: CalibrationRefinement) -> dict
         "given": _camera_table(refinement.given),
         "used": _camera_table(camera),
         "refinements": [
-            {"keyframes": r.num_keyframes, "accepted": r.accepted, "reason": r.reason, "deviations": r.deviations}
-            | _camera_table(r.camera)
+            {"keyframes": r.num_keyframes, "accepted": r.accepted, "reason": r.reason, "deviations": r.deviations} | _camera_table(r.camera)
             for r in refinement.history
         ],
     }

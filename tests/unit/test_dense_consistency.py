@@ -47,9 +47,9 @@ def test_comparison_is_that_of_the_definition():
 
 def test_what_is_contradicted_alone_loses_weight_and_nothing_else():
     view = wall(2.0)
-    view.depth[:, :40] = 1.5
+    view.depth[:, 50:80] = 1.5
     checked = doubted(view, [wall(2.0, 0.1)], CAMERA, 0.03, 0.1)
-    np.testing.assert_allclose(checked.weights[:, :40], 0.4)
-    np.testing.assert_allclose(checked.weights[:, 50:], 4.0)
+    np.testing.assert_allclose(checked.weights[:, 50:80], 0.4)
+    np.testing.assert_allclose(np.delete(checked.weights, np.s_[50:80], axis=1), 4.0)
     np.testing.assert_array_equal(checked.depth, view.depth)
     assert doubted(view, [], CAMERA, 0.03, 0.1) is view
