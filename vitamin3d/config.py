@@ -78,14 +78,14 @@ class ExtremaTrackingConfig:
 
     prediction: str = "dense_flow"
     """`dominant_flow` (Eq. 4, the paper) or `dense_flow` (DIS flow, several times more survivors)."""
-    flow_reduction: int = 3
+    flow_reduction: int = 2
     """The dense flow is computed on the picture reduced by this."""
     prediction_weight: float = 0.3
     """lambda of Eq. 5, relative to the noise floor's unit of kappa."""
     prediction_sigma_px: float = 3.0
     """sigma of w in Eq. 5."""
     max_steps: int = 10
-    gate_px: float = 1.1
+    gate_px: float = 1.05
     """A climb that ends farther from the prediction is a miss: where the flow is exact, a far extremum is another one."""
     coast_frames: int = 2
     """Frames in a row that a track may live on its prediction."""

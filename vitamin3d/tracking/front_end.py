@@ -12,8 +12,8 @@ from vitamin3d.tracking.dominant_flow import CoarseFeatures, coarse_features, es
 from vitamin3d.tracking.extrema import detect_extrema
 from vitamin3d.types import Array, DominantFlow, Frame, FrontEndFrame, StepTimes
 
-FINEST_SCALE, DESCENT_ITERATIONS, PATCH_STRIDE = 0, 8, 6
-"""DIS on a picture that is reduced already needs no scales to leave out, but no dense patches either."""
+FINEST_OCTAVE, DESCENT_ITERATIONS = 2, 8
+"""DIS stops at a quarter of the picture's size, whatever it is given."""
 IDENTITY_FLOW = DominantFlow(np.eye(2), np.zeros(2), 0.0)
 
 
@@ -24,8 +24,7 @@ class FrontEnd:
         self.config = config
         self.times = StepTimes()
         self._dis = cv2.DISOpticalFlow_create(cv2.DISOPTICAL_FLOW_PRESET_ULTRAFAST)  # type: ignore[attr-defined]
-        self._dis.setFinestScale(FINEST_SCALE)
-        self._dis.setPatchStride(PATCH_STRIDE)
+        self._dis.setFinestScale(max(0, FINEST_OCTAVE - round(float(np.log2(config.extrema_tracking.flow_reduction)))))
         self._dis.setGradientDescentIterations(DESCENT_ITERATIONS)
         self._reduced: Array | None = None
         self._features: CoarseFeatures | None = None
