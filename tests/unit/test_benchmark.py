@@ -139,8 +139,9 @@ def test_trials_are_scored_and_lightened(finished):
     assert [r["seed"] for r in results] == [0, 1] and all(r["frames"] == 45 and r["exit_code"] == 0 for r in results)
     assert all(1e-5 < r["ate"]["Sim(3)"] < 0.01 and r["success_rate"] > 0.9 for r in results)
     assert len(results[0]["chronological"]) > 30
-    kept = {path.name for path in (Path(job.folder) / "trial_0").iterdir()}
-    assert {"trajectory.tum", "stats.json", "mesh_high.ply", "report.html"} <= kept and not kept & {"depth", "normals", "mesh_high.obj"}
+    kept = {path.name for path in (Path(job.folder) / "trial_0").rglob("*") if path.is_file()}
+    assert {"trajectory.tum", "stats.json", "mesh_high.ply", "report.html", "canvas.yaml"} <= kept
+    assert "mesh_high.obj" not in kept and not [name for name in kept if name.endswith(".png")]
     assert not (Path(job.folder) / "trial_1" / "mesh_high.ply").exists()
 
 

@@ -3,7 +3,6 @@
 
 import ctypes
 import json
-import shutil
 import signal
 import subprocess
 import sys
@@ -24,7 +23,7 @@ from vitamin3d.exporters.files import write_file
 from vitamin3d.exporters.report import thinned_rows
 
 NO_MAP, BAD_INPUT = 3, 2
-HEAVY = ("depth", "normals", "mesh_high.obj", "mesh_low.ply", "tracks.npz")
+HEAVY = ("depth/*.png", "normals/*.png", "mesh_high.obj", "mesh_low.ply", "tracks.npz")
 """Files of a trial that are removed once it is scored, but for its first one, unless all are to be kept."""
 REMEMBERED = ("success_rate", "frames", "processed_frames", "keyframes", "cpu_seconds", "peak_memory_mb", "steps")
 """What of `stats.json`."""
@@ -116,12 +115,8 @@ def _errors(job: SequenceJob, out: Path) -> dict[str, Any]:
 
 
 def _lighten(out: Path, names: Sequence[str]) -> None:
-    for name in names:
-        path = out / name
-        if path.is_dir():
-            shutil.rmtree(path, ignore_errors=True)
-        else:
-            path.unlink(missing_ok=True)
+    for path in (path for name in names for path in out.glob(name)):
+        path.unlink(missing_ok=True)
 
 
 def die_with_parent() -> None:
