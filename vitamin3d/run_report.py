@@ -61,8 +61,11 @@ def add_evaluation(out: Path, run: Run, truth: Truth, report: dict[str, Any], of
 
 
 def read_truth_of(dataset: Dataset) -> Truth | None:
-    """The ground truth that a sequence brings, of the camera."""
-    own = dataset.ground_truth()
+    """The ground truth that a sequence brings, of the camera; None where it has none, or one that cannot be read."""
+    try:
+        own = dataset.ground_truth()
+    except InputError:  # a run that does not need the truth does not fail by it
+        return None
     return None if own is None else Truth(own, f"{dataset.name}'s own", TruthFrame.CAMERA)
 
 

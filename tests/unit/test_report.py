@@ -8,9 +8,11 @@ import numpy as np
 import pytest
 from browser import opened
 
+from vitamin3d.errors import InputError
 from vitamin3d.exporters import report as module
 from vitamin3d.exporters.rendering import jpeg
 from vitamin3d.exporters.report import Picture, Report, decimated, evaluation_section, quantised, report_html, with_evaluation
+from vitamin3d.run_report import read_truth_of
 from vitamin3d.types import Surface
 
 
@@ -88,6 +90,16 @@ def test_an_evaluation_is_put_in_and_replaced():
 
 def test_backslashes_of_a_table_survive():
     assert r"C:\1\g<0>" in with_evaluation(report_html(report()), r"C:\1\g<0>", np.zeros((1, 3)))
+
+
+def test_a_truth_that_cannot_be_read_is_none():
+    class Broken:
+        name = "broken"
+
+        def ground_truth(self):
+            raise InputError("data.csv, line 3: nonsense")
+
+    assert read_truth_of(Broken()) is None
 
 
 # --- the mesh --------------------------------------------------------------------------------------------------------
