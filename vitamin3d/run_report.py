@@ -147,7 +147,7 @@ def _tracked_extrema(dataset: Dataset, slam: Slam, keyframe: int) -> Picture | N
     drawn = cv2.resize(picture, None, fx=scale, fy=scale, interpolation=cv2.INTER_AREA if scale < 1 else cv2.INTER_CUBIC)
     for color, chosen in ((WAITING, ~is_landmark), (MAPPED, is_landmark)):
         for u, v in np.nan_to_num((pixels[chosen] + 0.5) * scale - 0.5, nan=-9.0):
-            cv2.circle(drawn, (round(float(u)), round(float(v))), 1, color, -1, cv2.LINE_AA)
+            cv2.circle(drawn, (round(float(u)), round(float(v))), 2, color, -1, cv2.LINE_AA)
     caption = f"frame {frame.index}: {int(is_landmark.sum())} landmarks (green), {int((~is_landmark).sum())} extrema without depth (amber)"
     return Picture(caption, jpeg(np.asarray(drawn), 78))
 

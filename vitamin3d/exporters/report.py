@@ -33,7 +33,7 @@ h1{font-size:24px;margin:22px 0 4px}h2{font-size:18px;margin:30px 0 8px;border-b
 .strip{display:flex;flex-wrap:wrap;gap:10px}.strip figure{margin:0;width:370px;max-width:100%}.strip img{width:100%;border-radius:4px}
 figcaption{font-size:12px;color:#57606a}table{border-collapse:collapse;font-size:13px}td,th{padding:3px 12px 3px 0;text-align:left}
 td.n,th.n{text-align:right;font-variant-numeric:tabular-nums}.bar{background:#1f6feb;height:9px;border-radius:2px}
-pre{background:#f6f8fa;padding:12px;overflow:auto;font-size:12px}svg{max-width:100%;height:auto}
+pre{background:#f6f8fa;padding:12px;overflow:auto;font-size:12px}svg{max-width:100%;height:auto}.strip svg{width:560px}
 """
 
 
