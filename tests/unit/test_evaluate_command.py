@@ -238,7 +238,7 @@ def test_a_truth_of_the_body_is_recognised_and_corrected(demo, tmp_path, figures
 def test_an_estimate_of_the_body_is_compared_with_the_body(demo, tmp_path, figures):
     rig = body_rig(demo, tmp_path)
     found = figures(rig / "body.tum", "-g", rig / "body.tum", "--calibration", rig / "sensor.yaml", "--truth-frame", "body")
-    assert found["ate"]["Sim(3)"]["rmse"] < 1e-6 and "so is the estimate" in found["truth"]["frame_remark"]
+    assert found["ate"]["Sim(3)"]["rmse"] < 1e-6 and "are of one frame" in found["truth"]["frame_remark"]
 
 
 def test_a_rig_that_stands_still_is_told_by_where_it_is(demo, tmp_path, figures, command):

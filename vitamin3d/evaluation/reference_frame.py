@@ -130,9 +130,9 @@ def recognise_frame(estimate: Trajectory, truth: Trajectory, T_body_cam: Array |
     certain = max(as_is, moved) > 0 and min(as_is, moved) < CLEARLY * max(as_is, moved)
     is_body = moved < as_is if certain else declared is TruthFrame.BODY
     if not is_body and declared is TruthFrame.BODY:
-        return FrameFinding(TruthFrame.CAMERA, certain, "the truth is of the body, and so is the estimate: not moved")
+        return FrameFinding(TruthFrame.CAMERA, certain, "the truth is said to be of the body, but it and the estimate are of one frame: not moved")
     if not is_body:
-        return FrameFinding(TruthFrame.CAMERA, certain, "the truth is of the camera")
+        return FrameFinding(TruthFrame.CAMERA, certain, f"the truth is {'' if certain else 'taken to be '}of the camera")
     how = "" if declared else " (recognised by how it turns and where it is)"
     remark = f"the truth is of the body; moved into the camera by T_BS{how}"
     return FrameFinding(TruthFrame.BODY, certain, remark, *_as_it_is(estimate, truth))
