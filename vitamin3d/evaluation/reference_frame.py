@@ -130,7 +130,8 @@ def recognise_frame(estimate: Trajectory, truth: Trajectory, T_body_cam: Array |
     certain = max(as_is, moved) > 0 and min(as_is, moved) < CLEARLY * max(as_is, moved)
     is_body = moved < as_is if certain else declared is TruthFrame.BODY
     if not is_body and declared is TruthFrame.BODY:
-        return FrameFinding(TruthFrame.CAMERA, certain, "the truth is said to be of the body, but it and the estimate are of one frame: not moved")
+        remark = "the truth is said to be of the body, but it and the estimate are of one frame: not moved"
+        return FrameFinding(TruthFrame.CAMERA, certain, remark)
     if not is_body:
         return FrameFinding(TruthFrame.CAMERA, certain, f"the truth is {'' if certain else 'taken to be '}of the camera")
     how = "" if declared else " (recognised by how it turns and where it is)"
