@@ -1,0 +1,46 @@
+# SPDX-License-Identifier: Apache-2.0
+import importlib.util
+from pathlib import Path
+
+import numpy as np
+import pytest
+from scenes import DEMO
+
+from vitamin3d.config import Config
+
+_SPEC = importlib.util.spec_from_file_location("landmark_funnel", Path(__file__).parents[2] / "tools" / "landmark_funnel.py")
+funnel = importlib.util.module_from_spec(_SPEC)
+_SPEC.loader.exec_module(funnel)
+REASONS, STAGES, main = funnel.REASONS, funnel.STAGES, funnel.main
+
+
+@pytest.fixture(scope="module")
+def slam():
+    return funnel.measure(DEMO, 60, Config())
+
+
+def test_each_stage_is_a_part_of_the_one_before(slam):
+    counts = list(funnel.stages(slam).values())
+    assert (np.diff(counts) <= 0).all() and counts[0] > 3000 and counts[-1] > 500
+    assert counts[3] == np.isfinite(slam.map.points_world[:, 0]).sum()
+
+
+def test_every_track_that_is_no_more_has_a_reason(slam):
+    assert sum(slam.ends.values()) == slam._next_id + slam.second_lives - len(slam.tracks) and slam.second_lives > 0
+    assert slam.ends[REASONS[1]] > slam.ends[REASONS[7]] == 0
+    assert 200 < funnel.good_per_keyframe(slam) < 5300
+
+
+def test_the_table_is_printed_and_written(tmp_path: Path, capsys):
+    page = tmp_path / "funnel.md"
+    assert main([str(DEMO), "--frames", "30", "--output", str(page)]) == 0
+    text = page.read_text()
+    assert capsys.readouterr().out == text
+    assert all(f"| {stage} |" in text for stage in STAGES) and len(text.splitlines()) == 2 + len(STAGES) + 1 + len(REASONS)
+
+
+def test_mistakes_are_named(tmp_path: Path, capsys):
+    assert main([str(tmp_path)]) == 2
+    assert str(tmp_path) in capsys.readouterr().err
+    assert main([str(DEMO), "--frames", "1"]) == 2
+    assert "--frames must be at least 2" in capsys.readouterr().err

@@ -1,0 +1,191 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Where extrema are lost on their way to good landmarks: a funnel of numbers, and the reason of each track's end.
+
+    python tools/landmark_funnel.py SEQUENCE [SEQUENCE ...] [--frames 300] [--config SETTINGS.toml] [--output funnel.md]
+
+A track is counted once, when it was detected; what became of its landmark is asked of the finished map.
+"""
+
+import argparse
+import sys
+from collections import Counter
+from pathlib import Path
+
+import cv2
+import numpy as np
+
+from vitamin3d.config import Config, load_toml
+from vitamin3d.datasets import open_dataset
+from vitamin3d.errors import InputError, Vitamin3dError
+from vitamin3d.exporters.files import write_file
+from vitamin3d.mapping.landmark_statistics import landmark_information, landmark_statistics, relative_depth_deviations
+from vitamin3d.runtime import run_sequential
+from vitamin3d.slam import Slam
+from vitamin3d.tracking.extrema_tracking import predict_by_dense_flow
+from vitamin3d.tracking.front_end import FrontEnd
+from vitamin3d.types import Array, FrontEndFrame
+
+STAGES = (
+    "detected",
+    "seen in 3 frames",
+    "mapped",
+    "landmark at the end",
+    "3 keyframes",
+    "parallax > 2°",
+    "parallax > 5°",
+    "deviation < 5 %",
+)
+REASONS = (
+    "left the picture",
+    "extremum vanished or beyond the gate",
+    "met another track",
+    "reprojection error",
+    "outlier of an adjustment",
+    "gave way to a landmark found again",
+    "became one with another landmark",
+    "camera jumped or lost",
+)
+MIN_FRAMES, MAX_DEVIATION, BORDER_PX = 3, 0.05, 2.0
+
+
+class FunnelSlam(Slam):
+    """`Slam` that keeps account of why tracks end."""
+
+    def __init__(self, *arguments: object) -> None:
+        super().__init__(*arguments)  # type: ignore[arg-type]
+        self.ends: Counter[str] = Counter()
+        self.ever_mapped: set[int] = set()
+        self.frames_seen: Counter[int] = Counter()
+        self.second_lives = 0
+        """Landmarks found again after their track had ended."""
+        self._known = self.tracks.ids
+
+    def _account(self, reason: str) -> int:
+        """Books the tracks that are gone since the last time under a reason; how many."""
+        lost = len(np.setdiff1d(self._known, self.tracks.ids))
+        self.ends[reason] += lost
+        self._known = self.tracks.ids
+        return lost
+
+    def process_frame(self, front: FrontEndFrame):  # type: ignore[no-untyped-def]
+        state = super().process_frame(front)
+        seen = self.tracks.ids[self.tracks.missed == 0]
+        self.frames_seen.update(seen.tolist())
+        self.ever_mapped.update(seen[self.map.is_mapped(seen)].tolist())
+        return state
+
+    def _track(self, front: FrontEndFrame):  # type: ignore[no-untyped-def]
+        before, config = self.tracks, self.config.extrema_tracking
+        self.tracks = super()._track(front)
+        lost = ~np.isin(before.ids, self.tracks.ids)
+        predicted = before.pixels
+        if front.dense_flow is not None:
+            predicted = predict_by_dense_flow(before.pixels, front.dense_flow, config.flow_reduction)
+        height, width = front.kappa.shape
+        left = lost & ~((predicted > BORDER_PX).all(axis=1) & (predicted < [width - 1 - BORDER_PX, height - 1 - BORDER_PX]).all(axis=1))
+        vanished = lost & ~left & (before.missed == config.coast_frames)
+        self.ends.update({REASONS[0]: int(left.sum()), REASONS[1]: int(vanished.sum()), REASONS[2]: int((lost & ~left & ~vanished).sum())})
+        self._known = self.tracks.ids
+        return self.tracks
+
+    def _refill(self, front: FrontEndFrame) -> None:
+        super()._refill(front)
+        self._known = self.tracks.ids
+
+    def _localize(self, front: FrontEndFrame):  # type: ignore[no-untyped-def]
+        pose = super()._localize(front)
+        self._account(REASONS[7] if pose is None else REASONS[3])
+        return pose
+
+    def _recover(self, *arguments: object) -> int:  # type: ignore[override]
+        self._account(REASONS[3] if len(self.tracks) else REASONS[7])
+        count = super()._recover(*arguments)  # type: ignore[arg-type]
+        self._account(REASONS[5])
+        self.second_lives += count
+        return count
+
+    def _merge_landmarks(self, T_cam_world: Array) -> None:
+        super()._merge_landmarks(T_cam_world)
+        self.second_lives += self._account(REASONS[6])
+
+    def _adjust_window(self) -> None:
+        super()._adjust_window()
+        self._account(REASONS[4])
+
+
+def stages(slam: FunnelSlam) -> dict[str, int]:
+    """How many tracks reached each stage; every stage is a part of the one before, from `landmark at the end` on."""
+    statistics = landmark_statistics(slam.map, slam.camera)
+    ids = np.flatnonzero(~np.isnan(slam.map.points_world[:, 0]))
+    keyframes, parallax = statistics.num_observations[ids] >= 3, statistics.parallax_deg[ids]
+    information = landmark_information(slam.map, ids, slam.camera, slam.config.snapshot.observation_sigma_px)
+    last = slam.map.T_cam_world[slam.map.keyframe_of(slam.map.last_observation[ids])]
+    sure = relative_depth_deviations(information, slam.map.points_world[ids], last) < MAX_DEVIATION
+    counts = (
+        len(slam.frames_seen), sum(n >= MIN_FRAMES for n in slam.frames_seen.values()), len(slam.ever_mapped), len(ids),
+        int(keyframes.sum()), int((keyframes & (parallax > 2)).sum()), int((keyframes & (parallax > 5)).sum()),
+        int((keyframes & (parallax > 5) & sure).sum()),
+    )  # fmt: skip
+    return dict(zip(STAGES, counts, strict=True))
+
+
+def good_per_keyframe(slam: FunnelSlam) -> float:
+    """Median number of landmarks with three observations and a deviation below 5 % of the depth that a keyframe observes."""
+    ids = np.flatnonzero(~np.isnan(slam.map.points_world[:, 0]) & (slam.map.num_observations >= 3))
+    information = landmark_information(slam.map, ids, slam.camera, slam.config.snapshot.observation_sigma_px)
+    last = slam.map.T_cam_world[slam.map.keyframe_of(slam.map.last_observation[ids])]
+    good = np.zeros(len(slam.map.points_world), np.bool_)
+    good[ids] = relative_depth_deviations(information, slam.map.points_world[ids], last) < MAX_DEVIATION
+    counts = [
+        int((good[slam.map.obs_landmark[rows]] & slam.map.obs_valid[rows]).sum())
+        for rows in map(slam.map.observations_of, range(slam.map.num_keyframes))
+    ]
+    return float(np.median(counts)) if counts else 0.0
+
+
+def measure(source: Path, frames: int | None, config: Config) -> FunnelSlam:
+    """The sequence tracked and mapped, with its account."""
+    dataset = open_dataset(source)
+    slam = FunnelSlam(dataset.camera, config)
+    run_sequential(dataset, range(min(len(dataset), frames or len(dataset))), FrontEnd(config), slam)
+    slam.finish()
+    return slam
+
+
+def table(columns: dict[str, FunnelSlam]) -> str:
+    """Markdown: a column per sequence."""
+    lines = ["| | " + " | ".join(columns) + " |", "|---" * (len(columns) + 1) + "|"]
+    reached = {name: stages(slam) for name, slam in columns.items()}
+    lines += [f"| {stage} | " + " | ".join(f"{reached[name][stage]:,}" for name in columns) + " |" for stage in STAGES]
+    good = " | ".join(f"{good_per_keyframe(slam):,.0f}" for slam in columns.values())
+    lines.append(f"| good (3 keyframes, deviation < 5 %) seen by a keyframe, median | {good} |")
+    for reason in REASONS:
+        shares = (slam.ends[reason] / max(1, sum(slam.ends.values())) for slam in columns.values())
+        lines.append(f"| tracks that ended: {reason} | " + " | ".join(f"{100 * share:.1f} %" for share in shares) + " |")
+    return "\n".join(lines) + "\n"
+
+
+def main(arguments: list[str] | None = None) -> int:
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("sources", type=Path, nargs="+", metavar="SEQUENCE")
+    parser.add_argument("--frames", type=int)
+    parser.add_argument("--config", type=Path)
+    parser.add_argument("--output", type=Path, help="also write the table to this file")
+    options = parser.parse_args(arguments)
+    cv2.setNumThreads(1)
+    try:
+        if options.frames is not None and options.frames < 2:
+            raise InputError(f"--frames must be at least 2, not {options.frames}")
+        config = load_toml(options.config) if options.config else Config()
+        text = table({source.resolve().name: measure(source, options.frames, config) for source in options.sources})
+        if options.output:
+            write_file(options.output, [text.encode()])
+    except Vitamin3dError as error:
+        print(f"landmark_funnel: {error}", file=sys.stderr)
+        return 2
+    print(text, end="")
+    return 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())
