@@ -40,7 +40,7 @@ def main(argv: list[str] | None = None) -> int:
 
     output.write_config(config)
     output.write_trajectories(slam.trajectory(), slam.keyframe_trajectory(), scale)
-    output.write_cloud(point_cloud(slam.map, slam.camera, config.cloud, config.snapshot.observation_sigma_px), scale, "")
+    output.write_cloud(point_cloud(slam.map, slam.camera, config.cloud, config.snapshot), scale, "")
     output.write_surfaces(*reconstruction.surfaces(), scale, reconstruction.voxel_lengths())
     print(f"{len(slam.trajectory())} of {len(dataset)} frames localised, {slam.map.num_keyframes} keyframes: {output.path}")
     return 0

@@ -118,7 +118,7 @@ def stages(slam: FunnelSlam) -> dict[str, int]:
     statistics = landmark_statistics(slam.map, slam.camera)
     ids = np.flatnonzero(~np.isnan(slam.map.points_world[:, 0]))
     keyframes, parallax = statistics.num_observations[ids] >= 3, statistics.parallax_deg[ids]
-    information = landmark_information(slam.map, ids, slam.camera, slam.config.snapshot.observation_sigma_px)
+    information = landmark_information(slam.map, ids, slam.camera, slam.config.snapshot)
     last = slam.map.T_cam_world[slam.map.keyframe_of(slam.map.last_observation[ids])]
     sure = relative_depth_deviations(information, slam.map.points_world[ids], last) < MAX_DEVIATION
     counts = (
@@ -132,7 +132,7 @@ def stages(slam: FunnelSlam) -> dict[str, int]:
 def good_per_keyframe(slam: FunnelSlam) -> float:
     """Median number of landmarks with three observations and a deviation below 5 % of the depth that a keyframe observes."""
     ids = np.flatnonzero(~np.isnan(slam.map.points_world[:, 0]) & (slam.map.num_observations >= 3))
-    information = landmark_information(slam.map, ids, slam.camera, slam.config.snapshot.observation_sigma_px)
+    information = landmark_information(slam.map, ids, slam.camera, slam.config.snapshot)
     last = slam.map.T_cam_world[slam.map.keyframe_of(slam.map.last_observation[ids])]
     good = np.zeros(len(slam.map.points_world), np.bool_)
     good[ids] = relative_depth_deviations(information, slam.map.points_world[ids], last) < MAX_DEVIATION

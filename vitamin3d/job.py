@@ -137,7 +137,7 @@ def _write_sparse(slam: Slam, scale: Scale, output: OutputFolder, job: Job) -> i
     if slam.map.num_keyframes == 0:
         return 0
     config = job.config.cloud
-    cloud = point_cloud(slam.map, slam.camera, config, job.config.snapshot.observation_sigma_px)
+    cloud = point_cloud(slam.map, slam.camera, config, job.config.snapshot)
     remark = (
         f"landmarks with at least {config.min_observations} observations, parallax from {config.min_parallax_deg} degrees, "
         f"reprojection RMS up to {config.max_reprojection_rms_px} px"

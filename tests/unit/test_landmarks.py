@@ -18,6 +18,7 @@ from vitamin3d.mapping.landmark_statistics import (
     landmark_statistics,
     point_cloud,
     relative_depth_deviations,
+    unit_information,
 )
 from vitamin3d.mapping.landmark_triangulation import triangulate_landmarks
 from vitamin3d.mapping.sparse_map import SparseMap
@@ -288,12 +289,16 @@ def test_statistics_equal_their_twin(noisy_map, order):
 
 def test_information_equals_its_twin(noisy_map):
     ids = np.flatnonzero(np.isfinite(noisy_map.points_world[:, 0]))[::-1]
-    found = landmark_information(noisy_map, ids, PINHOLE, 0.7)
+    found = landmark_information(noisy_map, ids, PINHOLE, SnapshotConfig(min_observation_sigma_px=0.05, shared_error=0.5))
     for H, id_ in zip(found, ids, strict=True):
-        expected = np.zeros((3, 3))
+        expected, squared, rows = np.zeros((3, 3)), 0.0, reference.counting_observations(noisy_map, id_)
         for _, k in reference.counting_observations(noisy_map, id_):
             _, J = reference.jacobians(PINHOLE.intrinsics, noisy_map.T_cam_world[k], noisy_map.points_world[id_])
-            expected += J.T @ J / 0.7**2
+            expected += J.T @ J
+        for i, k in rows:
+            r = reference.residual(PINHOLE.intrinsics, noisy_map.T_cam_world[k], noisy_map.points_world[id_], noisy_map.obs_pixels[i])
+            squared += r @ r
+        expected /= max(squared / max(2 * len(rows) - 3, 1), 0.05**2) * (1 + 0.5 * len(rows))
         np.testing.assert_allclose(H, expected, rtol=1e-9, atol=1e-9 * np.abs(expected).max())
 
 
@@ -305,7 +310,7 @@ def test_depth_deviation_is_what_noise_does_to_the_depth(scene, rng):
     J = np.vstack([reference.jacobians(PINHOLE.intrinsics, sparse_map.T_cam_world[k], X)[1] for _, k in rows])
     steps = np.linalg.lstsq(J, sigma * rng.standard_normal((len(J), 20_000)), rcond=None)[0]
     depths = (T[:3, :3] @ (X[:, None] + steps) + T[:3, 3:])[2]
-    deviation = relative_depth_deviations(landmark_information(sparse_map, np.array([id_]), PINHOLE, sigma), X[None], T)
+    deviation = relative_depth_deviations(unit_information(sparse_map, np.array([id_]), PINHOLE)[0] / sigma**2, X[None], T)
     assert deviation[0] == pytest.approx(depths.std() / depths.mean(), rel=0.03)
 
 
@@ -313,7 +318,7 @@ def test_one_view_leaves_the_depth_open(scene):
     sparse_map = map_of(scene)
     rows = [i for i, _ in reference.counting_observations(sparse_map, 5)]
     sparse_map.obs_valid[rows[1:]] = False
-    deviation = relative_depth_deviations(landmark_information(sparse_map, np.array([5]), PINHOLE, 1.0), scene.points[5:6], np.eye(4))
+    deviation = relative_depth_deviations(unit_information(sparse_map, np.array([5]), PINHOLE)[0], scene.points[5:6], np.eye(4))
     assert deviation[0] > 1e3
 
 
@@ -337,10 +342,10 @@ def test_the_cloud_is_filtered(noisy_map):
     config = CloudConfig(min_observations=3, min_parallax_deg=6.0, max_reprojection_rms_px=0.8)
     good = np.isfinite(noisy_map.points_world[:, 0]) & (statistics.num_observations >= 3)
     good &= (statistics.parallax_deg >= 6.0) & (statistics.reprojection_rms_px <= 0.8)
-    cloud = point_cloud(noisy_map, PINHOLE, config, 0.7)
+    cloud = point_cloud(noisy_map, PINHOLE, config, SnapshotConfig())
     assert 5 < good.sum() < 55
     np.testing.assert_array_equal(cloud.points_world, noisy_map.points_world[good])
     np.testing.assert_array_equal(cloud.num_observations, statistics.num_observations[good])
     np.testing.assert_array_equal(cloud.colors, noisy_map.colors[good])
     assert ((cloud.depth_deviation > 1e-4) & (cloud.depth_deviation < 0.05)).all()
-    assert len(point_cloud(noisy_map, PINHOLE, CloudConfig(min_observations=99), 0.7).points_world) == 0
+    assert len(point_cloud(noisy_map, PINHOLE, CloudConfig(min_observations=99), SnapshotConfig()).points_world) == 0

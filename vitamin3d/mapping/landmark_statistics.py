@@ -77,13 +77,28 @@ def landmark_statistics(sparse_map: SparseMap, camera: Camera) -> LandmarkStatis
     return LandmarkStatistics(count, np.sqrt(squared / np.maximum(count, 1)), parallax)
 
 
-def landmark_information(sparse_map: SparseMap, ids: Array, camera: Camera, sigma_px: float) -> Array:
-    """Inverse covariance (N, 3, 3) of landmarks (N,) ids, in the world, for observations good to sigma_px."""
-    return _information_and_rms(sparse_map, ids, camera)[0] / sigma_px**2
+def landmark_information(sparse_map: SparseMap, ids: Array, camera: Camera, config: SnapshotConfig) -> Array:
+    """Inverse covariance (N, 3, 3) of landmarks (N,) ids, in the world."""
+    information, squared, count = unit_information(sparse_map, ids, camera)
+    return np.asarray(information / observation_variances(squared, count, config)[:, None, None])
 
 
-def _information_and_rms(sparse_map: SparseMap, ids: Array, camera: Camera) -> tuple[Array, Array]:
-    """Sums of JᵀJ (N, 3, 3) per landmark and the RMS (N,) of its reprojection errors, pixels."""
+def observation_variances(squared: Array, count: Array, config: SnapshotConfig) -> Array:
+    """Variances (N,) in pixels² by which the inverse of a unit information becomes a covariance.
+
+    The noise of a landmark's observations is what its residuals show; a part of it they share (the extremum's bias, the
+    errors of neighbouring poses), which does not shrink with their number.
+
+    Args:
+        squared: (N,) sums of squared reprojection errors, pixels².
+        count: (N,) observations.
+    """
+    noise = np.maximum(squared / np.maximum(2 * count - 3, 1), config.min_observation_sigma_px**2)
+    return np.asarray(noise * (1.0 + config.shared_error * count))
+
+
+def unit_information(sparse_map: SparseMap, ids: Array, camera: Camera) -> tuple[Array, Array, Array]:
+    """Sums of JᵀJ (N, 3, 3) per landmark, in the world, for a pixel of noise; sums (N,) of its squared errors; counts (N,)."""
     wanted = np.full(len(sparse_map.points_world), -1, np.int64)
     wanted[ids] = np.arange(len(ids))
     poses, H, squared, count = sparse_map.T_cam_world, np.zeros((len(ids), 3, 3)), np.zeros(len(ids)), np.zeros(len(ids), np.int64)
@@ -93,7 +108,7 @@ def _information_and_rms(sparse_map: SparseMap, ids: Array, camera: Camera) -> t
         sparse_map.obs_pixels, sparse_map.first_observation, sparse_map.points_world, wanted, H,
         squared, count,
     )  # fmt: skip
-    return H, np.sqrt(squared / np.maximum(count, 1))
+    return H, squared, count
 
 
 def relative_depth_deviations(information: Array, points_world: Array, T_cam_world: Array) -> Array:
@@ -122,20 +137,21 @@ def keyframe_vertices(sparse_map: SparseMap, keyframe: int, camera: Camera, conf
     ids = ids[good]
     points, T = sparse_map.points_world[ids], sparse_map.T_cam_world[keyframe]
     in_camera = points @ T[:3, :3].T + T[:3, 3]
-    information, rms = _information_and_rms(sparse_map, ids, camera)
-    deviations = relative_depth_deviations(information / config.observation_sigma_px**2, points, T)
+    information, squared, count = unit_information(sparse_map, ids, camera)
+    variances, rms = observation_variances(squared, count, config), np.sqrt(squared / np.maximum(count, 1))
+    deviations = relative_depth_deviations(information / variances[:, None, None], points, T)
     usable = (in_camera[:, 2] > 0) & (deviations < config.max_relative_deviation) & (rms < config.max_reprojection_rms_px)
     return camera.ideal_from_points(in_camera[usable]), in_camera[usable, 2], deviations[usable]
 
 
-def point_cloud(sparse_map: SparseMap, camera: Camera, config: CloudConfig, sigma_px: float) -> PointCloud:
+def point_cloud(sparse_map: SparseMap, camera: Camera, config: CloudConfig, noise: SnapshotConfig) -> PointCloud:
     """The landmarks that pass the export's filter, with what is known about them."""
     statistics = landmark_statistics(sparse_map, camera)
     good = ~np.isnan(sparse_map.points_world[:, 0]) & (statistics.num_observations >= config.min_observations)
     good &= (statistics.parallax_deg >= config.min_parallax_deg) & (statistics.reprojection_rms_px <= config.max_reprojection_rms_px)
     ids = np.flatnonzero(good)
     points = sparse_map.points_world[ids]
-    information = landmark_information(sparse_map, ids, camera, sigma_px)
+    information = landmark_information(sparse_map, ids, camera, noise)
     last_seen_from = sparse_map.T_cam_world[sparse_map.keyframe_of(sparse_map.last_observation[ids])]
     return PointCloud(
         points,
