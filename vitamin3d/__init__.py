@@ -8,6 +8,10 @@ from importlib import import_module
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
+    from vitamin3d.bundle_adjustment.adjust import AdjustmentSettings, adjust
+    from vitamin3d.bundle_adjustment.marginalization import marginalize
+    from vitamin3d.bundle_adjustment.problem import make_problem
+    from vitamin3d.bundle_adjustment.self_calibration import adjust_with_intrinsics
     from vitamin3d.config import Config, load_toml, paper_config
     from vitamin3d.datasets import Unreadable, open_dataset
     from vitamin3d.evaluation.comparison import compare, read_other, read_own
@@ -25,6 +29,10 @@ if TYPE_CHECKING:
     from vitamin3d.types import Frame, SlamState, Surface, Trajectory
 
 _HOMES = {
+    "bundle_adjustment.adjust": ("AdjustmentSettings", "adjust"),
+    "bundle_adjustment.marginalization": ("marginalize",),
+    "bundle_adjustment.problem": ("make_problem",),
+    "bundle_adjustment.self_calibration": ("adjust_with_intrinsics",),
     "config": ("Config", "load_toml", "paper_config"),
     "datasets": ("Unreadable", "open_dataset"),
     "evaluation.comparison": ("compare", "read_other", "read_own"),
@@ -44,6 +52,7 @@ _HOMES = {
 _MODULES = {name: module for module, names in _HOMES.items() for name in names}
 
 __all__ = [
+    "AdjustmentSettings",
     "Camera",
     "Config",
     "Frame",
@@ -60,9 +69,13 @@ __all__ = [
     "Trajectory",
     "TruthRequest",
     "Unreadable",
+    "adjust",
+    "adjust_with_intrinsics",
     "compare",
     "evaluate",
     "load_toml",
+    "make_problem",
+    "marginalize",
     "open_dataset",
     "paper_config",
     "point_cloud",

@@ -499,6 +499,16 @@ def squared_errors(views, sightings, points, out):  # type: ignore[no-untyped-de
 
 
 @kernel
+def squared_errors_by_row(views, obs_camera, obs_point, pixels, points, out):  # type: ignore[no-untyped-def]
+    """`squared_errors` of observations in any order."""
+    R, t, _, models = views
+    distorted, many = models_are_distorted(models), models.shape[0] > 1
+    for i in range(obs_camera.shape[0]):
+        c = obs_camera[i]
+        out[i] = observation_error(R, t, c, models, c if many else 0, distorted, points, obs_point[i], pixels, i)
+
+
+@kernel
 def scale_upper(S, scale):  # type: ignore[no-untyped-def]
     """S[i, j] *= scale[i] scale[j] in the upper triangle."""
     for i in range(S.shape[0]):

@@ -6,7 +6,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from vitamin3d.bundle_adjustment.normal_equations import Sightings, Views, squared_errors
+from vitamin3d.bundle_adjustment.normal_equations import Sightings, Views, squared_errors_by_row
 from vitamin3d.bundle_adjustment.problem import BundleProblem
 from vitamin3d.geometry.camera import Camera
 from vitamin3d.types import Array, BundleReport
@@ -59,12 +59,10 @@ def pinhole_model(camera: Camera) -> Array:
 
 def squared_errors_of(problem: BundleProblem, models: Array) -> Array:
     """|r|² (M,) of all observations in pixels², inf behind the camera; models (1, 8) or (C, 8)."""
-    sightings, out = sightings_of(problem), np.empty(len(problem.obs_camera))
-    variables = Variables.of(problem, models)
-    squared_errors(variables.views(free_slots(problem)), sightings, variables.points, out)
-    by_row = np.empty_like(out)
-    by_row[problem.point_order] = out
-    return by_row
+    out, variables = np.empty(len(problem.obs_camera)), Variables.of(problem, models)
+    views = variables.views(free_slots(problem))
+    squared_errors_by_row(views, problem.obs_camera, problem.obs_point, np.ascontiguousarray(problem.obs_pixels), variables.points, out)
+    return out
 
 
 def squared_reprojection_errors(problem: BundleProblem, camera: Camera) -> Array:
