@@ -2,6 +2,7 @@
 """The demo data agree with themselves, and the tool that made them gives the same again."""
 
 import importlib.util
+import sys
 from itertools import pairwise
 from pathlib import Path
 from types import ModuleType
@@ -22,7 +23,7 @@ pytestmark = pytest.mark.filterwarnings("ignore:Open3D was built with CUDA:Impor
 def the_tool() -> ModuleType:
     spec = importlib.util.spec_from_file_location("render_sequence", ROOT / "tools" / "render_sequence.py")
     assert spec is not None and spec.loader is not None
-    module = importlib.util.module_from_spec(spec)
+    module = sys.modules[spec.name] = importlib.util.module_from_spec(spec)  # numba looks it up when it reads its cache
     spec.loader.exec_module(module)
     return module
 
