@@ -77,14 +77,14 @@ class Coverage:
 
 def coverage_of_truth(its: Array, ours: Array, truth: Array) -> Coverage:
     """Which of the true points (M, 3) have a point of theirs, and of ours, within 5 cm."""
-    a, b = (nearest(truth, points) < COVERED for points in (its, ours))
+    a, b = (nearest(truth, points, COVERED) < COVERED for points in (its, ours))
     return Coverage("truth", float((a & b).mean()), float((b & ~a).mean()), float((a & ~b).mean()))
 
 
 def coverage_of_voxels(its: Array, ours: Array, side: float = VOXELS[-1]) -> Coverage:
     """Which of the voxels that either occupies has a point of the other within one side."""
     cells = [_centres(points, side) for points in (its, ours)]
-    lone = [nearest(cells[k], points) > 1.5 * side for k, points in ((0, ours), (1, its))]
+    lone = [nearest(cells[k], points, 2.0 * side) > 1.5 * side for k, points in ((0, ours), (1, its))]
     its_only, ours_only = (int(missing.sum()) for missing in lone)
     both = max(len(cells[0]) - its_only, len(cells[1]) - ours_only)
     total = max(1, its_only + ours_only + both)

@@ -63,13 +63,13 @@ def register(source: Array, target: Array, seed: int = 0) -> Registration:
     rng = np.random.default_rng(seed)
     size = _size(target)
     ratio = size / max(_size(source), 1e-12)
-    some, others = _sample(source, COARSE_POINTS, rng), _sample(target, COARSE_POINTS, rng)
+    some, others = _Sample.of(source, COARSE_POINTS, rng), _Sample.of(target, COARSE_POINTS, rng)
     starts = product(Rotation.random(NUM_ROTATIONS, rng=rng).as_matrix(), SCALES)
     coarse = [_icp(some, others, (s * ratio, R, _middle(target) - s * ratio * R @ _middle(source)), COARSE_ROUNDS) for R, s in starts]
     best = sorted(coarse, key=lambda c: _score(some, others, c, size))[:FINALISTS]
-    middle, goal = _sample(source, 4 * COARSE_POINTS, rng), _sample(target, 4 * COARSE_POINTS, rng)
+    middle, goal = _Sample.of(source, 4 * COARSE_POINTS, rng), _Sample.of(target, 4 * COARSE_POINTS, rng)
     better = sorted((_icp(middle, goal, c, 2 * COARSE_ROUNDS) for c in best), key=lambda c: _score(middle, goal, c, size))[:4]
-    fine, ends = _sample(source, FINE_POINTS, rng), _sample(target, FINE_POINTS, rng)
+    fine, ends = _Sample.of(source, FINE_POINTS, rng), _Sample.of(target, FINE_POINTS, rng)
     fitted = min((_icp(fine, ends, c, FINE_ROUNDS) for c in better), key=lambda c: _score(fine, ends, c, size))
     return _judged(source, target, *_tightened(source, target, fitted, size), size)
 
@@ -77,16 +77,34 @@ def register(source: Array, target: Array, seed: int = 0) -> Registration:
 Similarity = tuple[float, Array, Array]
 
 
-def _icp(source: Array, target: Array, start: Similarity, rounds: int) -> Similarity:
+@dataclass(frozen=True)
+class _Sample:
+    """Some points of a cloud and the tree that finds the nearest of them."""
+
+    points: Array
+    tree: cKDTree
+
+    @staticmethod
+    def of(points: Array, count: int, rng: np.random.Generator) -> "_Sample":
+        some = points if len(points) <= count else points[rng.choice(len(points), count, replace=False)]
+        return _Sample(some, cKDTree(some))
+
+
+def _pairs(source: _Sample, target: _Sample, similarity: Similarity) -> tuple[tuple[Array, Array], tuple[Array, Array]]:
+    """Distances in the target's unit, and indices, from the source to the target and back; each tree stays where it is."""
+    s, R, t = similarity
+    back, i = source.tree.query((target.points - t) @ R / s)
+    return target.tree.query(s * source.points @ R.T + t), (s * back, i)
+
+
+def _icp(source: _Sample, target: _Sample, start: Similarity, rounds: int) -> Similarity:
     """Trimmed point-to-point ICP with scale, pairs from both sides."""
-    tree, (s, R, t) = cKDTree(target), start
+    s, R, t = start
     for _ in range(rounds):
-        placed = s * source @ R.T + t
-        there, j = tree.query(placed)
-        back, i = cKDTree(placed).query(target)
+        (there, j), (back, i) = _pairs(source, target, (s, R, t))
         kept_there, kept_back = (d <= np.quantile(d, KEPT) for d in (there, back))
-        a = np.concatenate([source[kept_there], source[i[kept_back]]])
-        b = np.concatenate([target[j[kept_there]], target[kept_back]])
+        a = np.concatenate([source.points[kept_there], source.points[i[kept_back]]])
+        b = np.concatenate([target.points[j[kept_there]], target.points[kept_back]])
         if len(a) < 3 or np.ptp(a, axis=0).max() < 1e-12:
             break
         s, R, t = align_sim3(a, b)
@@ -106,11 +124,9 @@ def _tightened(source: Array, target: Array, start: Similarity, size: float) -> 
     return s, R, t
 
 
-def _score(source: Array, target: Array, similarity: Similarity, size: float) -> float:
+def _score(source: _Sample, target: _Sample, similarity: Similarity, size: float) -> float:
     """Mean of bounded distances both ways, relative to the size: small is good."""
-    s, R, t = similarity
-    placed = s * source @ R.T + t
-    both = [np.minimum(cKDTree(b).query(a)[0], 0.1 * size).mean() for a, b in ((placed, target), (target, placed))]
+    both = [np.minimum(distance, 0.1 * size).mean() for distance, _ in _pairs(source, target, similarity)]
     return float(max(both) / size)
 
 
@@ -129,7 +145,3 @@ def _middle(points: Array) -> Array:
 def _size(points: Array) -> float:
     """Twice the 80th percentile of the distances to the middle."""
     return 2.0 * float(np.percentile(np.linalg.norm(points - _middle(points), axis=1), 80))
-
-
-def _sample(points: Array, count: int, rng: np.random.Generator) -> Array:
-    return points if len(points) <= count else points[rng.choice(len(points), count, replace=False)]

@@ -76,14 +76,14 @@ def surface_area(geometry: Geometry) -> float:
     return float(0.5 * np.linalg.norm(np.cross(b - a, c - a), axis=1).sum())
 
 
-def nearest(points: Array, others: Array) -> Array:
-    """Distances (N,) from each point to the nearest of the others."""
-    return np.asarray(cKDTree(others).query(points)[0])
+def nearest(points: Array, others: Array, at_most: float = np.inf) -> Array:
+    """Distances (N,) from each point to the nearest of the others; infinite beyond `at_most`, which is faster."""
+    return np.asarray(cKDTree(others).query(points, distance_upper_bound=at_most)[0])
 
 
 def surface_errors(points: Array, truth: Array) -> SurfaceErrors:
     """All figures of estimated points (N, 3) against points (M, 3) of the true surface, both in metres and in one world."""
-    to_truth, to_estimate = nearest(points, truth), nearest(truth, points)
+    to_truth, to_estimate = nearest(points, truth, CUT_OFF), nearest(truth, points, FARTHEST)
     seen = to_truth[to_truth < OBSERVED]
     seen = seen if len(seen) else np.array([np.nan])
     completion = np.minimum(to_estimate, FARTHEST).mean()
