@@ -19,6 +19,7 @@ CLOUD = np.dtype(
     + [("num_observations", "<i4")]
     + [(n, "<f4") for n in ("parallax_deg", "reprojection_rms_px", "depth_deviation")]
 )
+QUALITY = ("num_observations", "parallax_deg", "reprojection_rms_px", "depth_deviation")
 PLY_NAMES = {"<f4": "float", "|u1": "uchar", "<i4": "int"}
 CHUNK_LINES = 20_000
 
@@ -51,9 +52,31 @@ def write_cloud_ply(cloud: PointCloud, path: Path, comments: list[str]) -> None:
     points = np.empty(len(cloud.points_world), CLOUD)
     _fill(points, POSITION, cloud.points_world)
     _fill(points, COLOR, cloud.colors)
-    for name in ("num_observations", "parallax_deg", "reprojection_rms_px", "depth_deviation"):
+    for name in QUALITY:
         points[name] = getattr(cloud, name)
     write_file(path, [_header(points, comments, []), points.tobytes()])
+
+
+def read_cloud_ply(path: Path) -> tuple[PointCloud, list[str]]:
+    """A cloud that `write_cloud_ply` wrote, and its comments.
+
+    Raises:
+        InputError: the file cannot be read, or is another kind of PLY.
+    """
+    try:
+        data = path.read_bytes()
+    except OSError as error:
+        raise InputError(f"{path}: cannot be read ({error.strerror})") from None
+    header, _, body = data.partition(b"end_header\n")
+    lines = header.decode("ascii", "replace").splitlines()
+    count = _element_count(lines, "vertex")
+    expected = _header(np.empty(count, CLOUD), [], []).decode().splitlines()[:-1]
+    if [line for line in lines if not line.startswith("comment ")] != expected or len(body) != count * CLOUD.itemsize:
+        raise InputError(f"{path}: not a cloud that vitamin3d wrote, or cut short; write it again")
+    table = np.frombuffer(body, CLOUD)
+    points, colors = (np.stack([table[n] for n in names], axis=1) for names in (POSITION, COLOR))
+    quality = (np.array(table[name]) for name in QUALITY)
+    return PointCloud(points.astype(np.float64), colors, *quality), [line[8:] for line in lines if line.startswith("comment ")]
 
 
 def write_obj(surface: Surface, path: Path, comments: list[str]) -> None:
