@@ -5,7 +5,7 @@ import numpy as np
 import pytest
 import reference_dense as reference
 
-from vitamin3d.config import Config, DelaunayConfig, DensificationConfig, FusionConfig, SurfaceConfig
+from vitamin3d.config import Config, DelaunayConfig, DensificationConfig, FusionConfig, NltgvConfig, SurfaceConfig
 from vitamin3d.geometry.se3 import exp_se3, inverse
 from vitamin3d.reconstruction import Reconstruction
 from vitamin3d.types import StepTimes
@@ -17,6 +17,7 @@ CONFIG = dataclasses.replace(
     delaunay=DelaunayConfig(min_vertices=20),
     surface=SurfaceConfig(min_component_triangles=20),
     densification=DensificationConfig(enabled=False),
+    nltgv=NltgvConfig(data_weight=1.5),
 )
 
 
