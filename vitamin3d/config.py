@@ -326,7 +326,7 @@ class NltgvConfig:
 
     enabled: bool = True
     iterations: int = 400
-    data_weight: float = 10.0
+    data_weight: float = 4.0
     """lambda."""
     full_deviation: float = 0.02
     """omega of a vertex = full_deviation / relative deviation of its depth."""
