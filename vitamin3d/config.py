@@ -164,8 +164,9 @@ class RecoveryConfig:
     max_distance_ratio: float = 1.25
     gate_px: float = 2.0
     min_zncc: float = 0.8
-    merge_distance: float = 0.02
-    """A landmark that meets a tracked one becomes one with it where they are this near in space, relative to the depth; 0: never."""
+    merge_distance: float = 0.0
+    """A landmark that meets a tracked one becomes one with it where they are this near in space, relative to the depth (0.02, say);
+    0: never. Of the copies of a place each is one more measurement: merging gained nothing on exact pictures and cost real ones."""
     min_observations: int = 3
 
 
@@ -367,9 +368,9 @@ class ConsistencyConfig:
 class FusionConfig:
     """Sec. 4.2: the two TSDF volumes."""
 
-    backend: str = "blocks"
-    """`blocks` (ours; every pixel weighs by the certainty of its depth), or Open3D's `scalable` (ScalableTSDFVolume) or
-    `voxel_block_grid`, where all weigh the same."""
+    backend: str = "scalable"
+    """Open3D's `scalable` (ScalableTSDFVolume) or `voxel_block_grid`, where all pixels that are certain enough weigh the same; or
+    `blocks` (ours), where each weighs by its certainty."""
     voxel_low: float | None = None
     """Metres where the scale is known, else map units; None: median depth of the scene / 20 (and / 120)."""
     voxel_high: float | None = None
@@ -378,6 +379,8 @@ class FusionConfig:
     keyframes_for_depth: int = 30
     """Keyframes whose depths decide the voxels; fusion waits for them where the voxels are not given."""
     truncation_voxels: float = 3.0
+    max_relative_deviation: float = 0.028
+    """Pixels whose depth has a larger deviation, relative to the depth, are not fused (not of `blocks`)."""
     max_deviation_voxels: float = 4.5
     """The surface ends where all views together leave a larger deviation of the depth (`blocks` alone)."""
     max_depth: float = 3.0
@@ -436,6 +439,7 @@ def paper_config() -> Config:
         final_adjustment=FinalAdjustmentConfig(enabled=False),
         densification=DensificationConfig(enabled=False),
         consistency=ConsistencyConfig(enabled=False),
+        fusion=FusionConfig(max_relative_deviation=1e3),
         calibration=CalibrationConfig(refine="off"),
         bundle_adjustment=BundleAdjustmentConfig(keyframe_solver="subspace", keyframe_iterations=20),
     )

@@ -17,7 +17,7 @@ from vitamin3d.dense.depth_rendering import DepthRenderer
 from vitamin3d.dense.neighbour_queue import Around, NeighbourQueue
 from vitamin3d.dense.nltgv import denoise
 from vitamin3d.dense.surface_extraction import clean
-from vitamin3d.dense.tsdf_fusion import TsdfVolume, empty_surface
+from vitamin3d.dense.tsdf_fusion import Limits, TsdfVolume, empty_surface
 from vitamin3d.geometry.camera import Camera
 from vitamin3d.types import DepthView, MapSnapshot, StepTimes, Surface
 
@@ -158,8 +158,8 @@ class Reconstruction:
 
     def _volume(self, voxel_length: float) -> TsdfVolume:
         fusion = self.config.fusion
-        truncation, deviation = fusion.truncation_voxels * voxel_length, fusion.max_deviation_voxels * voxel_length
-        return TsdfVolume(voxel_length, truncation, deviation, fusion.backend)
+        limits = Limits(fusion.max_relative_deviation, fusion.max_deviation_voxels * voxel_length)
+        return TsdfVolume(voxel_length, fusion.truncation_voxels * voxel_length, limits, fusion.backend)
 
     def _surface(self, volume: TsdfVolume | None) -> Surface:
         if volume is None or self.high is None:

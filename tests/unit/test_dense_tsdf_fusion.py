@@ -1,11 +1,13 @@
 # SPDX-License-Identifier: Apache-2.0
+import dataclasses
+
 import numpy as np
 import pytest
 import reference_dense as reference
 from scipy.spatial import cKDTree
 
 from vitamin3d.dense import tsdf_fusion
-from vitamin3d.dense.tsdf_fusion import BACKENDS, TsdfVolume, check_backend, empty_surface
+from vitamin3d.dense.tsdf_fusion import BACKENDS, Limits, TsdfVolume, check_backend, empty_surface
 from vitamin3d.errors import DependencyError, InputError
 from vitamin3d.geometry.se3 import exp_se3, inverse, transform_points
 from vitamin3d.types import DepthView
@@ -13,6 +15,7 @@ from vitamin3d.types import DepthView
 pytestmark = pytest.mark.filterwarnings("ignore:Open3D was built with CUDA:ImportWarning")
 CAMERA = reference.SMALL
 VOXEL = 0.03
+LIMITS = Limits(1e3, 1e3)
 
 
 def view_of_sphere(T_cam_world, unit=1.0, wall=2.0):
@@ -33,7 +36,7 @@ def view_of_sphere(T_cam_world, unit=1.0, wall=2.0):
 
 
 def fused(backend, unit=1.0, max_depth=5.0, poses=((0, 0, 0), (0.2, 0, 0), (0, -0.2, 0.1))):
-    volume = TsdfVolume(VOXEL * unit, 4 * VOXEL * unit, 1e3, backend)
+    volume = TsdfVolume(VOXEL * unit, 4 * VOXEL * unit, LIMITS, backend)
     for x, y, z in poses:
         T_world_cam = exp_se3(np.array([x, y, z, 0.2 * y, -0.2 * x, 0.05]))
         volume.integrate(view_of_sphere(inverse(T_world_cam), unit), CAMERA, max_depth * unit)
@@ -87,6 +90,16 @@ def test_what_is_too_far_is_not_fused(backend):
     assert fused(backend, max_depth=1.7).vertices_world[:, 2].max() < 1.6
 
 
+@pytest.mark.parametrize("backend", ["scalable", "voxel_block_grid"])
+def test_what_is_too_uncertain_for_its_depth_is_not_fused(backend):
+    view = view_of_sphere(np.eye(4))  # the sphere is nearer than 1.5, the wall at 2, both known to 0.05
+    view = dataclasses.replace(view, weights=np.full_like(view.depth, 0.05**-2))
+    volume = TsdfVolume(VOXEL, 4 * VOXEL, Limits(0.03, 1e3), backend)
+    volume.integrate(view, CAMERA, 5.0)
+    far = volume.extract_surface().vertices_world
+    assert len(far) > 500 and far[:, 2].min() > 1.8
+
+
 @pytest.mark.parametrize("backend", list(BACKENDS))
 def test_the_order_of_the_views_does_not_matter(backend):
     poses = ((0, 0, 0), (0.2, 0, 0), (0, -0.2, 0.1))
@@ -97,7 +110,7 @@ def test_the_order_of_the_views_does_not_matter(backend):
 @pytest.mark.parametrize("backend", list(BACKENDS))
 def test_extrinsics_are_camera_from_world(backend):
     T_world_cam = exp_se3(np.array([0.5, -0.4, 0.3, 0.1, 1.2, -0.7]))
-    volume = TsdfVolume(VOXEL, 4 * VOXEL, 1e3, backend)
+    volume = TsdfVolume(VOXEL, 4 * VOXEL, LIMITS, backend)
     depth = np.full((CAMERA.height, CAMERA.width), 1.5, np.float32)
     color = np.zeros((*depth.shape, 3), np.uint8)
     volume.integrate(DepthView(0, inverse(T_world_cam), depth, color.astype(np.float32), color, np.ones_like(depth)), CAMERA, 3.0)
@@ -107,7 +120,7 @@ def test_extrinsics_are_camera_from_world(backend):
 
 @pytest.mark.parametrize("backend", list(BACKENDS))
 def test_an_empty_volume_has_an_empty_surface(backend):
-    volume = TsdfVolume(VOXEL, 4 * VOXEL, 1e3, backend)
+    volume = TsdfVolume(VOXEL, 4 * VOXEL, LIMITS, backend)
     nothing = np.zeros((CAMERA.height, CAMERA.width, 3), np.uint8)
     zeros = nothing[..., 0].astype(np.float32)
     volume.integrate(DepthView(0, np.eye(4), zeros, nothing.astype(np.float32), nothing, zeros), CAMERA, 2.0)
@@ -117,7 +130,7 @@ def test_an_empty_volume_has_an_empty_surface(backend):
 
 def test_an_open3d_that_fuses_nothing_is_refused(monkeypatch):
     class Dead:
-        def __init__(self, voxel_length, truncation, max_deviation): ...
+        def __init__(self, voxel_length, truncation, limits): ...
 
         def integrate(self, view, canvas, max_depth): ...
 
@@ -131,4 +144,4 @@ def test_an_open3d_that_fuses_nothing_is_refused(monkeypatch):
 
 def test_unknown_backends_are_refused():
     with pytest.raises(InputError, match="voxel_block_grid"):
-        TsdfVolume(0.1, 0.4, 1.0, "octree")
+        TsdfVolume(0.1, 0.4, LIMITS, "octree")

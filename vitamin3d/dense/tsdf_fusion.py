@@ -1,6 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """Depth views -> a truncated signed distance field -> a mesh (Sec. 4.2, "Mesh Integration in TSDF"; Curless and Levoy 1996)."""
 
+from dataclasses import dataclass
 from functools import cache
 from typing import Any, Protocol
 
@@ -15,27 +16,37 @@ BLOCK_RESOLUTION = 16
 """Voxels along the side of a block; both backends allocate by blocks."""
 
 
+@dataclass(frozen=True)
+class Limits:
+    """What is too uncertain to be fused."""
+
+    relative_deviation: float
+    """Of a pixel's depth over the depth; beyond it Open3D's volumes, which know no weights, do not get the pixel."""
+    surface_deviation: float
+    """Map units; the surface of `blocks` ends where all views together know it worse than this."""
+
+
 class TsdfVolume:
     """A volume that depth views are averaged into; coarse and fine are two instances.
 
     Args:
         voxel_length: map units.
         truncation: map units; distances are kept up to this far from a surface.
-        max_deviation: map units; the surface ends where the views together know it worse than this (`blocks` alone).
-        backend: `blocks` (ours; every pixel has its weight), `scalable` (Open3D's ScalableTSDFVolume) or `voxel_block_grid`
-            (its tensor twin), where all pixels weigh the same.
+        limits: what is too uncertain to be fused.
+        backend: `scalable` (Open3D's ScalableTSDFVolume), `voxel_block_grid` (its tensor twin) or `blocks` (ours; every pixel
+            has its weight, in the others all weigh the same).
 
     Raises:
         InputError: no such backend.
         DependencyError: the installed Open3D fuses nothing.
     """
 
-    def __init__(self, voxel_length: float, truncation: float, max_deviation: float, backend: str = "blocks") -> None:
+    def __init__(self, voxel_length: float, truncation: float, limits: Limits, backend: str = "scalable") -> None:
         if backend not in BACKENDS:
             raise InputError(f"fusion.backend must be one of {', '.join(BACKENDS)}, not {backend!r}")
         check_backend(backend)
         self.voxel_length = voxel_length
-        self._volume = BACKENDS[backend](voxel_length, truncation, max_deviation)
+        self._volume = BACKENDS[backend](voxel_length, truncation, limits)
 
     def integrate(self, view: DepthView, canvas: Camera, max_depth: float) -> None:
         """Averages a view, drawn on `canvas`, into the volume; depths beyond `max_depth` (map units) are left out."""
@@ -48,7 +59,7 @@ class TsdfVolume:
 
 
 class _Backend(Protocol):
-    def __init__(self, voxel_length: float, truncation: float, max_deviation: float) -> None: ...
+    def __init__(self, voxel_length: float, truncation: float, limits: Limits) -> None: ...
 
     def integrate(self, view: DepthView, canvas: Camera, max_depth: float) -> None: ...
 
@@ -58,9 +69,10 @@ class _Backend(Protocol):
 class _ScalableVolume:
     """Open3D's ScalableTSDFVolume."""
 
-    def __init__(self, voxel_length: float, truncation: float, max_deviation: float) -> None:
+    def __init__(self, voxel_length: float, truncation: float, limits: Limits) -> None:
         import open3d as o3d
 
+        self._limits = limits
         self._volume = o3d.pipelines.integration.ScalableTSDFVolume(
             voxel_length=voxel_length,
             sdf_trunc=truncation,
@@ -74,7 +86,7 @@ class _ScalableVolume:
 
         rgbd = o3d.geometry.RGBDImage.create_from_color_and_depth(
             o3d.geometry.Image(np.ascontiguousarray(view.color)),
-            o3d.geometry.Image(np.ascontiguousarray(view.depth, np.float32)),
+            o3d.geometry.Image(certain_depth(view, self._limits.relative_deviation)),
             depth_scale=1.0,
             depth_trunc=max_depth,
             convert_rgb_to_intensity=False,
@@ -90,10 +102,10 @@ class _ScalableVolume:
 class _VoxelBlockGrid:
     """Open3D's tensor VoxelBlockGrid on the CPU (its `ray_cast` crashes at random and is never called)."""
 
-    def __init__(self, voxel_length: float, truncation: float, max_deviation: float) -> None:
+    def __init__(self, voxel_length: float, truncation: float, limits: Limits) -> None:
         import open3d as o3d
 
-        self._truncation_voxels = truncation / voxel_length
+        self._truncation_voxels, self._limits = truncation / voxel_length, limits
         self._grid = o3d.t.geometry.VoxelBlockGrid(
             attr_names=("tsdf", "weight", "color"),
             attr_dtypes=(o3d.core.float32, o3d.core.float32, o3d.core.float32),
@@ -107,7 +119,7 @@ class _VoxelBlockGrid:
     def integrate(self, view: DepthView, canvas: Camera, max_depth: float) -> None:
         import open3d as o3d
 
-        depth = o3d.t.geometry.Image(o3d.core.Tensor(np.ascontiguousarray(view.depth, np.float32)))
+        depth = o3d.t.geometry.Image(o3d.core.Tensor(certain_depth(view, self._limits.relative_deviation)))
         color = o3d.t.geometry.Image(o3d.core.Tensor(view.color.astype(np.float32) / 255.0))
         K, T = o3d.core.Tensor(canvas.K), o3d.core.Tensor(np.ascontiguousarray(view.T_cam_world, np.float64))
         scales = (1.0, max_depth, self._truncation_voxels)
@@ -126,8 +138,8 @@ class _VoxelBlockGrid:
 class _WeightedBlocks:
     """Our blocks of voxels."""
 
-    def __init__(self, voxel_length: float, truncation: float, max_deviation: float) -> None:
-        self._volume = BlockVolume(voxel_length, truncation, max_deviation)
+    def __init__(self, voxel_length: float, truncation: float, limits: Limits) -> None:
+        self._volume = BlockVolume(voxel_length, truncation, limits.surface_deviation)
 
     def integrate(self, view: DepthView, canvas: Camera, max_depth: float) -> None:
         self._volume.integrate(view, canvas, max_depth)
@@ -136,7 +148,12 @@ class _WeightedBlocks:
         return _surface(*self._volume.extract())
 
 
-BACKENDS: dict[str, type[_Backend]] = {"blocks": _WeightedBlocks, "scalable": _ScalableVolume, "voxel_block_grid": _VoxelBlockGrid}
+BACKENDS: dict[str, type[_Backend]] = {"scalable": _ScalableVolume, "voxel_block_grid": _VoxelBlockGrid, "blocks": _WeightedBlocks}
+
+
+def certain_depth(view: DepthView, max_relative_deviation: float) -> Array:
+    """The view's depth (H, W) float32 without the pixels (0) whose deviation is above this share of their depth."""
+    return np.where(view.weights * (max_relative_deviation * view.depth) ** 2 >= 1.0, view.depth, 0.0).astype(np.float32)
 
 
 def empty_surface() -> Surface:
@@ -160,7 +177,7 @@ def check_backend(backend: str) -> None:
     """
     canvas = Camera(40.0, 40.0, 19.5, 19.5, 40, 40)
     depth, normals, color = np.ones((40, 40), np.float32), np.zeros((40, 40, 3), np.float32), np.full((40, 40, 3), 128, np.uint8)
-    volume = BACKENDS[backend](0.04, 0.16, 10.0)
+    volume = BACKENDS[backend](0.04, 0.16, Limits(10.0, 10.0))
     volume.integrate(DepthView(0, np.eye(4), depth, normals, color, np.ones_like(depth)), canvas, 2.0)
     if not _is_plane_at_one(volume.extract_surface().vertices_world):
         import open3d as o3d
