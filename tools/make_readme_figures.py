@@ -36,6 +36,7 @@ def parsed(argv: list[str] | None) -> argparse.Namespace:
     parser.add_argument("--keyframe", type=int, default=0)
     parser.add_argument("--back", type=float, default=0.0)
     parser.add_argument("--up", type=float, default=0.0)
+    parser.add_argument("--without-picture", action="store_true", help="the extrema alone, where the picture may not be shown")
     parser.add_argument("--width", type=int, default=600, help="of each panel")
     return parser.parse_args(argv)
 
@@ -49,6 +50,8 @@ def tracked_extrema(arguments: argparse.Namespace, timestamp_ns: int) -> Array:
         raise InputError(f"{arguments.out}: no tracks.npz, or no picture for it; reconstruct with --save-tracks")
     tracks = np.load(arguments.out / "tracks.npz")
     picture = np.repeat(frame.image[..., None], 3, axis=2) if frame.color is None else frame.color.copy()
+    if arguments.without_picture:
+        picture[:] = 0
     scale = max(1, round(2 * arguments.width / picture.shape[1]))
     picture = cv2.resize(picture, None, fx=scale, fy=scale, interpolation=cv2.INTER_CUBIC)
     for u, v in (tracks["pixel"][tracks["frame_index"] == index] + 0.5) * scale - 0.5:

@@ -223,7 +223,7 @@ def test_killed_in_the_middle_and_started_again(tmp_path):
     children = children_of(first.pid)
     first.kill()
     first.wait()
-    wait_for(lambda: not any(Path(f"/proc/{child}/exe").exists() for child in children), 10)
+    wait_for(lambda: not any(Path(f"/proc/{child}/exe").exists() for child in children), 60)
     assert not later.is_file()
     stamp = done.stat().st_mtime_ns
     second = subprocess.run(arguments, cwd=ROOT, capture_output=True, text=True, check=False)
