@@ -26,7 +26,20 @@ FORBIDDEN = {
     "evaluation": ("tracking", "mapping", "dense"),
 }
 """Unit -> what it must not import from `vitamin3d.`; the empty name: nothing of ours at all."""
-ABOVE = ("slam", "reconstruction", "runtime", "job", "run_statistics", "run_report", "benchmark", "progress", "commands", "cli")
+ABOVE = (
+    "slam",
+    "reconstruction",
+    "warmup",
+    "workers",
+    "runtime",
+    "job",
+    "run_statistics",
+    "run_report",
+    "benchmark",
+    "progress",
+    "commands",
+    "cli",
+)
 LAZY = ("open3d", "pymeshlab")
 MAX_LINES = 60
 
@@ -68,7 +81,7 @@ def test_numba_is_imported_in_one_file():
 
 
 def test_threads_are_known_to_one_file():
-    assert importers("threading", "queue", "multiprocessing", "concurrent", "asyncio") == {"runtime.py"}
+    assert importers("threading", "queue", "multiprocessing", "concurrent", "asyncio") == {"workers.py"}
 
 
 def test_heavy_libraries_are_imported_where_they_are_used():

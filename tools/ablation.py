@@ -107,7 +107,7 @@ def run(trial: Trial, config: Config) -> Score:
     """Tracks and maps the sequence once."""
     front_end, slam = FrontEnd(config), Slam(trial.dataset.camera, config)
     start = time.process_time()
-    record = run_sequential(trial.dataset, trial.indices, front_end, slam, keep_tracks=trial.score_tracks)
+    record = run_sequential(trial.dataset, trial.indices, front_end, slam, record=RunRecord(tracks=[] if trial.score_tracks else None))
     slam.finish()
     seconds = time.process_time() - start
     return Score(

@@ -8,9 +8,10 @@ import typer
 from vitamin3d.commands.benchmark import benchmark
 from vitamin3d.commands.compare import compare
 from vitamin3d.commands.evaluate import evaluate
-from vitamin3d.commands.process import EXIT_ERROR
+from vitamin3d.commands.process import EXIT_BROKEN, EXIT_ERROR
 from vitamin3d.commands.reconstruct import reconstruct, show_config
-from vitamin3d.errors import Vitamin3dError
+from vitamin3d.commands.warmup import warmup
+from vitamin3d.errors import Vitamin3dError, WorkerError
 
 app = typer.Typer(add_completion=False, no_args_is_help=True, pretty_exceptions_enable=False, rich_markup_mode=None)
 
@@ -24,6 +25,7 @@ app.command()(reconstruct)
 app.command()(evaluate)
 app.command()(compare)
 app.command()(benchmark)
+app.command()(warmup)
 app.command("config")(show_config)
 
 
@@ -36,9 +38,12 @@ def version() -> None:
 
 
 def main() -> None:
-    """The console script: our errors become one line and exit code 2."""
+    """The console script: our errors become one line and exit code 2, a step that broke one line and 1."""
     try:
         app()
+    except WorkerError as error:
+        print(f"vitamin3d: {error} (what was reconstructed before is saved)", file=sys.stderr)
+        sys.exit(EXIT_BROKEN)
     except Vitamin3dError as error:
         print(f"vitamin3d: {error}", file=sys.stderr)
         sys.exit(EXIT_ERROR)

@@ -195,6 +195,10 @@ class WindowConfig:
     anchors: int = 60
     """Older keyframes, poses fixed, that share most landmarks with the window."""
     min_shared_landmarks: int = 20
+    settled_keyframes: int = 0
+    """A keyframe goes to the dense half when so many newer ones are there; 0: when it has left the window."""
+    settled_frames: int = 0
+    """Or when so many frames came after it, where the camera rests; 0: never for that reason."""
 
 
 @dataclass(frozen=True)
@@ -442,6 +446,26 @@ def paper_config() -> Config:
         fusion=FusionConfig(max_relative_deviation=1e3),
         calibration=CalibrationConfig(refine="off"),
         bundle_adjustment=BundleAdjustmentConfig(keyframe_solver="subspace", keyframe_iterations=20),
+    )
+
+
+def live_config(base: Config) -> Config:
+    """`base` for cameras that do not wait: fewer keyframes, smaller windows, meshes of landmarks alone, fused soon after they were seen.
+
+    Nothing is adjusted again at the end: the mesh is there already. The volume is ours, since Open3D's lets no other thread run
+    while it integrates a view.
+    """
+    change = dataclasses.replace
+    return change(
+        base,
+        keyframes=change(base.keyframes, motion_px=20.0),
+        window=change(base.window, keyframes=10, anchors=min(20, base.window.anchors), settled_keyframes=5, settled_frames=15),
+        bundle_adjustment=change(base.bundle_adjustment, keyframe_iterations=3, sweeps_per_frame=0),
+        final_adjustment=change(base.final_adjustment, enabled=False),
+        calibration=change(base.calibration, refine="off"),
+        densification=change(base.densification, enabled=False),
+        consistency=change(base.consistency, near=1, far=2),
+        fusion=change(base.fusion, keyframes_for_depth=10, backend="blocks"),
     )
 
 

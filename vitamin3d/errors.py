@@ -16,3 +16,7 @@ class OutputError(Vitamin3dError):
 
 class DependencyError(Vitamin3dError):
     """An installed library does not do what it must; the message names it and the remedy."""
+
+
+class WorkerError(Vitamin3dError):
+    """A step of a run failed in a way nobody foresaw; the message names step and cause. The command line exits with 1."""

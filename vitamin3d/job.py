@@ -2,7 +2,9 @@
 """The whole job: a sequence in, an output folder with trajectory, cloud, meshes and maps out."""
 
 import dataclasses
-from collections.abc import Iterator
+from bisect import bisect_right
+from collections.abc import Callable, Iterable, Iterator
+from contextlib import suppress
 from dataclasses import dataclass
 from typing import Any
 
@@ -14,12 +16,14 @@ from vitamin3d.exporters.output_folder import OutputFolder
 from vitamin3d.mapping.landmark_statistics import point_cloud
 from vitamin3d.reconstruction import Reconstruction
 from vitamin3d.run_report import write_report
-from vitamin3d.run_statistics import Stopwatch, run_statistics
-from vitamin3d.runtime import Observer, RunRecord, run_ahead, run_sequential, run_threaded
+from vitamin3d.run_statistics import Stopwatch, live_table, run_statistics
+from vitamin3d.runtime import DENSE_NICENESS, Observer, RunRecord, run_ahead, run_live, run_sequential, run_threaded
 from vitamin3d.scale import Scale, scale_from_ground_truth
 from vitamin3d.slam import Slam
 from vitamin3d.tracking.front_end import FrontEnd
-from vitamin3d.types import MapSnapshot
+from vitamin3d.types import DepthView, MapSnapshot
+from vitamin3d.warmup import warm_up
+from vitamin3d.workers import Clock, step
 
 VOXEL_LOW_M, VOXEL_HIGH_M = 0.15, 0.025
 """Table 3 of the paper; the defaults where the scale is known."""
@@ -54,7 +58,9 @@ class Job:
     scale_from_truth: bool = False
     save_tracks: bool = False
     live: bool = False
-    """Keyframes are fused while the camera is tracked; else after the final adjustment of the map."""
+    """Keyframes are fused while the camera is tracked; else after the final adjustment of the map. See `live_config`."""
+    realtime: bool = False
+    """Pictures come when their time stamps say; with `live` and `threads` only."""
 
 
 @dataclass(frozen=True)
@@ -77,41 +83,95 @@ def reconstruct_sequence(dataset: Dataset, job: Job, output: OutputFolder, obser
     Raises:
         InputError: the selection or the scale cannot be had.
         OutputError: a file cannot be written.
+        WorkerError: a step failed; it names the step.
     """
-    watch, indices = Stopwatch(), job.selection.indices(len(dataset))
-    _check_scale_source(dataset, job)
-    job = _with_steady_camera(job)
-    front_end, slam = FrontEnd(job.config), Slam(dataset.camera, job.config)
-    scale = Scale(job.metric_scale, "given") if job.metric_scale else Scale()
-    dense = _Dense(dataset, job, output, scale)
-    run = run_threaded if job.threads else run_sequential
+    run = _JobRun(dataset, job, output, observer)
     try:
-        record = run(dataset, indices, front_end, slam, dense.add if job.live else None, observer, job.save_tracks)
-    except Exception:
-        _write_sparse(slam, scale, output, job)
-        dense.write_surfaces()
+        run.reconstruct()
+    except Exception as error:
+        run.save_after(error)
         raise
-    slam.finish()
-    if slam.map.num_keyframes and not job.live:
-        dense.camera = slam.camera
-        dense.scale = scale = scale_from_ground_truth(slam.trajectory(), dataset.ground_truth()) if job.scale_from_truth else scale
-        dense.add_all(slam, observer)
-    cloud_points = _write_sparse(slam, scale, output, job)
-    dense.write_surfaces()
-    if record.tracks is not None:
-        output.write_tracks(record.tracks)
-    times = [front_end.times, slam.times, *([dense.reconstruction.times] if dense.reconstruction else [])]
-    stats = run_statistics(slam, record, scale, cloud_points, times, watch)
-    stats |= {"source": dataset.name, "mode": job.config.mode, "voxels": dense.voxels(), "skipped": [_line(s) for s in record.skipped]}
-    output.write_stats(stats)
-    write_report(output.path, dataset, slam, record)
-    return Outcome(slam, record, scale, stats)
+    return run.save()
+
+
+class _JobRun:
+    """What a job has come to so far."""
+
+    def __init__(self, dataset: Dataset, job: Job, output: OutputFolder, observer: Observer) -> None:
+        self.watch, self.indices = Stopwatch(), job.selection.indices(len(dataset))
+        _check_scale_source(dataset, job)
+        self.dataset, self.job, self.output, self.observer = dataset, _with_steady_camera(job), output, observer
+        config = self.job.config
+        self.front_end, self.slam = FrontEnd(config), Slam(dataset.camera, config)
+        self.record = RunRecord(tracks=[] if job.save_tracks else None)
+        self.clock = Clock() if job.realtime else None
+        self.dense = _Dense(dataset, self.job, output, Scale(job.metric_scale, "given") if job.metric_scale else Scale(), self.clock)
+
+    def reconstruct(self) -> None:
+        """Everything but the files that are written at the end."""
+        if self.job.realtime:
+            warm_up([self.job.config])
+        source = (self.dataset, self.indices, self.front_end, self.slam)
+        if self.job.live and self.job.threads:
+            run_live(*source, self.dense.add_all, self.observer, self.record, self.clock)
+        else:
+            run = run_threaded if self.job.threads else run_sequential
+            run(*source, self.dense.add if self.job.live else None, self.observer, self.record)
+        with step("final adjustment"):
+            self.slam.finish()
+        if self.slam.map.num_keyframes and not self.job.live:
+            self.dense.camera = self.slam.camera
+            if self.job.scale_from_truth:
+                self.dense.scale = scale_from_ground_truth(self.slam.trajectory(), self.dataset.ground_truth())
+            self.dense.add_all(self._snapshots(), self._keyframe_done)
+
+    def _snapshots(self) -> Iterator[MapSnapshot]:
+        """The keyframes of the finished map, their pictures read again."""
+        for keyframe, frame_index in enumerate(self.slam.map.frame_indices):
+            frame = self.dataset.read(frame_index)
+            if not isinstance(frame, Unreadable):
+                yield self.slam.snapshot(keyframe, frame)
+
+    def _keyframe_done(self, view: DepthView) -> None:
+        keyframes = self.slam.map.timestamps_ns
+        self.observer.keyframe_done(bisect_right(keyframes, view.timestamp_ns), len(keyframes))
+
+    def save(self) -> Outcome:
+        """Writes what is there."""
+        cloud_points = _write_sparse(self.slam, self.dense.scale, self.output, self.job)
+        self.dense.write_surfaces()
+        return self._conclude(cloud_points)
+
+    def save_after(self, failure: Exception) -> None:
+        """Writes what can still be written; whatever fails now has the same cause, or a later one that matters less."""
+        cloud_points = 0
+        with suppress(Exception):
+            cloud_points = _write_sparse(self.slam, self.dense.scale, self.output, self.job)
+        with suppress(Exception):
+            self.dense.write_surfaces(is_broken=True)
+        with suppress(Exception):
+            self._conclude(cloud_points, failure)
+
+    def _conclude(self, cloud_points: int, failure: Exception | None = None) -> Outcome:
+        if self.record.tracks is not None:
+            self.output.write_tracks(self.record.tracks)
+        dense, scale = self.dense, self.dense.scale
+        times = [self.front_end.times, self.slam.times, *([dense.reconstruction.times] if dense.reconstruction else [])]
+        stats = run_statistics(self.slam, self.record, scale, cloud_points, times, self.watch)
+        stats |= {"source": self.dataset.name, "mode": self.job.config.mode, "voxels": dense.voxels()}
+        stats |= {"skipped": [_line(s) for s in self.record.skipped], "failure": str(failure) if failure else None}
+        stats |= {"live": live_table(self.record, dense.mesh_lags) if self.job.live else None}
+        self.output.write_stats(stats)
+        write_report(self.output.path, self.dataset, self.slam, self.record)
+        return Outcome(self.slam, self.record, scale, stats)
 
 
 def _check_scale_source(dataset: Dataset, job: Job) -> None:
     """InputError where the scale is to come from a ground truth that is not there, or not there in time."""
     if job.scale_from_truth and dataset.ground_truth() is None:
         raise InputError(f"{dataset.name}: --scale-from-ground-truth, but the source has no ground truth; use --metric-scale")
+    if job.realtime and not (job.live and job.threads):
+        raise InputError("--realtime is a live run on threads; leave --sequential out")
     if job.scale_from_truth and job.live:
         raise InputError("--scale-from-ground-truth needs the whole trajectory before anything is fused; leave --live out")
 
@@ -125,6 +185,12 @@ def _with_steady_camera(job: Job) -> Job:
         raise InputError("--refine-calibration on and --live exclude each other: cameras that differ would be fused; leave one out")
     config = dataclasses.replace(job.config, calibration=dataclasses.replace(calibration, refine="off"))
     return dataclasses.replace(job, config=config)
+
+
+def _named(name: str, source: Iterator[Any]) -> Iterator[Any]:
+    """The items of a generator, whose failure names the step."""
+    with step(name):
+        yield from source
 
 
 def _line(skipped: Unreadable) -> str:
@@ -151,29 +217,34 @@ def _write_sparse(slam: Slam, scale: Scale, output: OutputFolder, job: Job) -> i
 class _Dense:
     """The dense half and its files; open3d is loaded when the first keyframe comes."""
 
-    def __init__(self, dataset: Dataset, job: Job, output: OutputFolder, scale: Scale) -> None:
-        self.dataset, self.job, self.output, self.scale, self.camera = dataset, job, output, scale, dataset.camera
+    def __init__(self, dataset: Dataset, job: Job, output: OutputFolder, scale: Scale, clock: Clock | None) -> None:
+        self.job, self.output, self.scale, self.camera, self.clock = job, output, scale, dataset.camera, clock
         self.reconstruction: Reconstruction | None = None
+        self.mesh_lags: list[float] = []
+        """Seconds from when a keyframe's picture was due until it was in the volume; where there is a clock."""
 
     def add(self, snapshot: MapSnapshot) -> None:
         """Takes a keyframe; fuses those that are ready and writes their maps."""
         for view in self._begun().add_keyframe(snapshot):
             self.output.write_view(view, self.scale)
 
-    def add_all(self, slam: Slam, observer: Observer) -> None:
-        """All keyframes of a finished map, their pictures read again; the views are computed ahead of the fusion."""
-        order = {time: k for k, time in enumerate(slam.map.timestamps_ns, 1)}
-        views = self._begun().depth_views(self._snapshots(slam))
-        for view in run_ahead(views) if self.job.threads else views:
-            self._begun().fuse(view)
+    def add_all(self, snapshots: Iterable[MapSnapshot], done: Callable[[DepthView], None] | None = None) -> None:
+        """All keyframes that come; their views are computed ahead of the fusion."""
+        views = _named("meshing", self._views(snapshots))
+        for view in run_ahead(views, "meshing", DENSE_NICENESS if self.job.live else 0) if self.job.threads else views:
+            with step(f"fusing the view of {view.timestamp_ns / 1e9:.3f} s"):
+                self._begun().fuse(view)
+            if self.clock is not None:
+                self.mesh_lags.append(self.clock.seconds_since(view.timestamp_ns))
             self.output.write_view(view, self.scale)
-            observer.keyframe_done(order[view.timestamp_ns], slam.map.num_keyframes)
+            if done is not None:
+                done(view)
 
-    def _snapshots(self, slam: Slam) -> Iterator[MapSnapshot]:
-        for keyframe, frame_index in enumerate(slam.map.frame_indices):
-            frame = self.dataset.read(frame_index)
-            if not isinstance(frame, Unreadable):
-                yield slam.snapshot(keyframe, frame)
+    def _views(self, snapshots: Iterable[MapSnapshot]) -> Iterator[DepthView]:
+        for snapshot in snapshots:
+            yield from self._begun().depth_views_ready(snapshot)
+        if self.reconstruction is not None:
+            yield from self.reconstruction.last_depth_views()
 
     def _begun(self) -> Reconstruction:
         if self.reconstruction is None:
@@ -181,10 +252,12 @@ class _Dense:
             self.output.write_canvas(self.reconstruction.canvas, self.scale)
         return self.reconstruction
 
-    def write_surfaces(self) -> None:
-        """Fuses what still waits, and writes the meshes."""
+    def write_surfaces(self, is_broken: bool = False) -> None:
+        """Fuses what still waits (not where a step is broken), and writes the meshes."""
         if self.reconstruction is None:
             return
+        if is_broken:
+            self.reconstruction.forget_waiting()
         for view in self.reconstruction.finish():
             self.output.write_view(view, self.scale)
         if self.reconstruction.median_depths:

@@ -11,6 +11,7 @@ from rich.progress import BarColumn, MofNCompleteColumn, Progress, TaskID, TextC
 
 from vitamin3d.datasets.pictures import Unreadable
 from vitamin3d.slam import Slam
+from vitamin3d.warmup import warm_up
 
 SECONDS_BETWEEN_LINES = 5.0
 
@@ -74,3 +75,19 @@ class ConsoleObserver:
             raise KeyboardInterrupt
         self._stop = True
         self.line("stopping: what is reconstructed so far is being saved (Ctrl-C again: at once, nothing saved)")
+
+
+def warmed_up() -> float:
+    """Compiles or loads all kernels behind a bar (lines where there is no terminal); seconds that it took."""
+    console, begun = Console(file=sys.stderr, highlight=False, soft_wrap=True), time.monotonic()
+    columns = (TextColumn("compiling kernels"), BarColumn(), TimeElapsedColumn(), TextColumn("{task.description}"))
+    with Progress(*columns, console=console, disable=not console.is_terminal) as progress:
+        task = progress.add_task("", total=None)
+
+        def tell(done: int, total: int, name: str) -> None:
+            progress.update(task, completed=done, total=total, description=name)
+            if not console.is_terminal:
+                console.print(f"compiling kernels: {done} of {total}, {name}", markup=False)
+
+        warm_up(tell=tell)
+    return time.monotonic() - begun

@@ -55,17 +55,31 @@ class Reconstruction:
 
     def add_keyframe(self, snapshot: MapSnapshot) -> list[DepthView]:
         """Takes a keyframe, in the order of time, and fuses those that have all their neighbours by now; their views."""
-        return self._fused(self._views(self._ready(snapshot)))
+        return self._fused(self.depth_views_ready(snapshot))
 
     def finish(self) -> list[DepthView]:
         """Fuses the keyframes that waited for neighbours; their views."""
-        return self._fused(self._last_views())
+        return self._fused(self.last_depth_views())
 
     def depth_views(self, snapshots: Iterable[MapSnapshot]) -> Iterator[DepthView]:
         """The views of a whole sequence of keyframes, not fused yet; those with too few landmarks have none."""
         for snapshot in snapshots:
-            yield from self._views(self._ready(snapshot))
-        yield from self._last_views()
+            yield from self.depth_views_ready(snapshot)
+        yield from self.last_depth_views()
+
+    def depth_views_ready(self, snapshot: MapSnapshot) -> Iterator[DepthView]:
+        """Takes a keyframe, in the order of time; the views that have all their neighbours by now, not fused yet."""
+        yield from self._views(self._ready(snapshot))
+
+    def last_depth_views(self) -> Iterator[DepthView]:
+        """The views of keyframes that waited for neighbours, not fused yet: none will follow."""
+        yield from self._views(self._keyframes.flush())
+        yield from map(self._checked, self._drawn.flush())
+
+    def forget_waiting(self) -> None:
+        """Keyframes that wait for neighbours will not be fused."""
+        self._keyframes.clear()
+        self._drawn.clear()
 
     def _fused(self, views: Iterator[DepthView]) -> list[DepthView]:
         done = []
@@ -89,10 +103,6 @@ class Reconstruction:
             view = self.depth_view(snapshot)
             if view is not None:
                 yield from map(self._checked, self._drawn.push(view))
-
-    def _last_views(self) -> Iterator[DepthView]:
-        yield from self._views(self._keyframes.flush())
-        yield from map(self._checked, self._drawn.flush())
 
     def _checked(self, around: Around[DepthView]) -> DepthView:
         config = self.config.consistency

@@ -14,7 +14,7 @@ from vitamin3d.mapping.calibration_refinement import CalibrationRefinement
 from vitamin3d.runtime import RunRecord, median_of
 from vitamin3d.scale import Scale
 from vitamin3d.slam import Slam
-from vitamin3d.types import StepTimes
+from vitamin3d.types import Array, StepTimes
 
 PACKAGES = ("vitamin3d", "numpy", "scipy", "numba", "opencv-python-headless", "open3d", "pymeshlab")
 
@@ -70,6 +70,35 @@ def calibration_table(camera: Camera, refinement: CalibrationRefinement) -> dict
 
 def _camera_table(camera: Camera) -> dict[str, float]:
     return dict(zip(("fx", "fy", "cx", "cy", "k1", "k2", "p1", "p2"), camera.model.tolist(), strict=True))
+
+
+LATE_MS = 50.0
+
+
+def live_table(record: RunRecord, mesh_lags: list[float]) -> dict[str, Any]:
+    """What a live run left out; and with a clock what came late.
+
+    A frame's latency is the time from when its picture was due until its pose was there; it is late where that took longer
+    than LATE_MS. A mesh's lag is the time until the keyframe's view was in the volume.
+    """
+    table: dict[str, Any] = {
+        "keyframes_offered": record.keyframes_offered,
+        "keyframes_dropped": record.keyframes_dropped,
+        "adjustments_skipped": record.adjustments_skipped,
+    }
+    if record.latencies:
+        milliseconds = np.array([1e3 * seconds for _, seconds in record.latencies])
+        table["realtime"] = {
+            "latency_ms": _spread(milliseconds),
+            "late_frames": [[index, round(1e3 * seconds, 1)] for index, seconds in record.latencies if 1e3 * seconds > LATE_MS],
+            "late_share": round(float((milliseconds > LATE_MS).mean()), 6),
+            "mesh_lag_seconds": _spread(np.array(mesh_lags)) if mesh_lags else None,
+        }
+    return table
+
+
+def _spread(values: Array) -> dict[str, float]:
+    return {name: round(float(np.percentile(values, share)), 3) for name, share in (("median", 50), ("p95", 95), ("worst", 100))}
 
 
 def run_statistics(

@@ -1,14 +1,14 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Runs a sequence through the steps; the only place that knows about threads.
+"""Runs a sequence through the steps.
 
-`run_sequential` does one thing after the other. `run_threaded` reads and computes curvature and flow ahead of the map
-and reconstructs behind it, joined by bounded queues of immutable messages. Both give the same result.
+`run_sequential` does one thing after the other. `run_threaded` decodes pictures and computes curvature and flow ahead of
+the map and reconstructs behind it, joined by bounded queues of immutable messages; both give the same result. `run_live`
+never lets a frame wait for the back end: windows are adjusted on a thread of their own while the camera is tracked on, and
+keyframes for which the dense half has no time are not meshed.
 """
 
-import contextlib
-import queue
-import threading
 from collections.abc import Callable, Iterable, Iterator
+from contextlib import ExitStack
 from dataclasses import dataclass, field
 from typing import Any, Protocol
 
@@ -17,13 +17,21 @@ import numpy as np
 
 from vitamin3d.datasets.base import Dataset
 from vitamin3d.datasets.pictures import Unreadable
+from vitamin3d.mapping.window_adjustment import AdjustAtOnce, WindowAdjustment
 from vitamin3d.slam import Slam
 from vitamin3d.tracking.front_end import FrontEnd
-from vitamin3d.types import Array, FrontEndFrame, MapSnapshot, SlamState
+from vitamin3d.types import Array, Frame, FrontEndFrame, MapSnapshot, SlamState
+from vitamin3d.workers import Clock, Consumer, Errand, ReadAhead, step
 
 READ_AHEAD = 4
-SNAPSHOTS_AHEAD = 8
+SNAPSHOTS_AHEAD, LIVE_SNAPSHOTS_AHEAD = 8, 2
+ADJUSTMENT_NICENESS, DENSE_NICENESS = 3, 10
+"""In live runs the front end comes first, then the map, then the mesh."""
 
+KeyframeHand = Callable[[int, Frame, bool], None]
+"""Takes a settled keyframe and its picture; True: the recording is over."""
+SnapshotConsumer = Callable[[Iterator[MapSnapshot]], None]
+"""Consumes keyframes as they come, on a thread of its own."""
 SnapshotSink = Callable[[MapSnapshot], None]
 
 
@@ -67,13 +75,21 @@ class RunRecord:
     interrupted: bool = False
     tracks: list[tuple[int, Array, Array]] | None = None
     """Frame index, ids (N,) and distorted pixels (N, 2) per frame, where they are kept."""
+    keyframes_offered: int = 0
+    """To the dense half."""
+    keyframes_dropped: int = 0
+    """Which the dense half had no time for (live runs)."""
+    adjustments_skipped: int = 0
+    """Keyframes that came while the window before was still being adjusted (live runs)."""
+    latencies: list[tuple[int, float]] | None = None
+    """Frame index, and seconds from when its picture was due until it was done; where there is a clock."""
 
 
 class _Run:
-    """The steps of a run on the mapping thread, shared by both ways of running."""
+    """The steps of a run on the mapping thread, shared by all ways of running."""
 
-    def __init__(self, slam: Slam, record: RunRecord, observer: Observer, sink: SnapshotSink | None) -> None:
-        self.slam, self.record, self.observer, self.sink = slam, record, observer, sink
+    def __init__(self, slam: Slam, record: RunRecord, observer: Observer, hand: KeyframeHand, clock: Clock | None = None) -> None:
+        self.slam, self.record, self.observer, self.hand, self.clock = slam, record, observer, hand, clock
 
     def all_frames(self, fronts: Iterable[FrontEndFrame | Unreadable]) -> RunRecord:
         """Frame by frame until the end, or until the observer stops it; then the last keyframes are handed over."""
@@ -82,6 +98,8 @@ class _Run:
                 self.record.interrupted = True
                 break
             self.frame(front)
+        with step("mapping"):
+            self.slam.take_adjustment(wait=True)
         self.hand_over(everything=True)
         return self.record
 
@@ -90,7 +108,10 @@ class _Run:
             self.record.skipped.append(front)
             self.observer.frame_skipped(front)
         else:
-            self.record.states.append(self.slam.process_frame(front))
+            with step(f"tracking and mapping frame {front.frame.index}"):
+                self.record.states.append(self.slam.process_frame(front))
+            if self.clock is not None and self.record.latencies is not None:
+                self.record.latencies.append((front.frame.index, self.clock.seconds_since(front.frame.timestamp_ns)))
             self._record_tracks(front.frame.index)
             self.hand_over()
         done = len(self.record.skipped) + len(self.record.states)
@@ -99,8 +120,7 @@ class _Run:
     def hand_over(self, everything: bool = False) -> None:
         """Keyframes that nothing will move any more go to the dense half."""
         for keyframe, frame in self.slam.take_settled_keyframes(everything):
-            if self.sink is not None:
-                self.sink(self.slam.snapshot(keyframe, frame))
+            self.hand(keyframe, frame, everything)
 
     def _record_tracks(self, frame_index: int) -> None:
         seen = self.slam.tracks.select(self.slam.tracks.missed == 0)
@@ -116,17 +136,21 @@ def run_sequential(
     slam: Slam,
     sink: SnapshotSink | None = None,
     observer: Observer | None = None,
-    keep_tracks: bool = False,
+    record: RunRecord | None = None,
 ) -> RunRecord:
     """Runs the frames `indices` of a dataset, one step after the other.
 
     Args:
         sink: gets each keyframe once the window has left it, in order; None: the caller asks `slam` afterwards.
         observer: hears of each frame and may stop the run.
-        keep_tracks: the record keeps the tracks of each frame.
+        record: is filled while the run lasts, so that it is there when a step fails; it keeps tracks where it has a list for them.
+
+    Raises:
+        WorkerError: a step failed; it names the step.
     """
-    run = _start(indices, slam, sink, observer, keep_tracks)
-    return run.all_frames(_front_frames(dataset, indices, front_end))
+    record = _begin(indices, record)
+    run = _Run(slam, record, observer or SilentObserver(), _hand_to(slam, record, sink))
+    return run.all_frames(_front_frames(_pictures(dataset, indices), front_end))
 
 
 def run_threaded(
@@ -136,134 +160,123 @@ def run_threaded(
     slam: Slam,
     sink: SnapshotSink | None = None,
     observer: Observer | None = None,
-    keep_tracks: bool = False,
+    record: RunRecord | None = None,
 ) -> RunRecord:
-    """As `run_sequential`, with a thread that reads ahead and one that calls `sink`; the result is the same.
+    """As `run_sequential`, with threads that decode and compute the front end ahead and one that calls `sink`; the result is the same."""
+    record = _begin(indices, record)
+    with ExitStack() as threads:
+        put = threads.enter_context(Consumer(_each_to(sink), "dense", SNAPSHOTS_AHEAD)).put if sink else None
+        fronts = threads.enter_context(_fronts_ahead(threads, _pictures(dataset, indices), front_end, None))
+        return _Run(slam, record, observer or SilentObserver(), _hand_to(slam, record, put)).all_frames(fronts)
 
-    Raises:
-        Whatever a worker raised, after the others have stopped.
+
+def run_live(
+    dataset: Dataset,
+    indices: range,
+    front_end: FrontEnd,
+    slam: Slam,
+    consume: SnapshotConsumer | None = None,
+    observer: Observer | None = None,
+    record: RunRecord | None = None,
+    clock: Clock | None = None,
+) -> RunRecord:
+    """As `run_threaded`, but the camera waits for nothing: windows are adjusted beside it, and meshing drops what it has no time for.
+
+    Args:
+        consume: iterates over the keyframes that are to be meshed, on a thread of its own.
+        clock: pictures come when their time stamps say; None: as fast as they are tracked.
+
+    Which windows are adjusted and which keyframes are meshed depends on how busy the machine is: runs differ.
     """
-    with _Worker(SNAPSHOTS_AHEAD, sink) as dense, _ReadAhead(_front_frames(dataset, indices, front_end)) as fronts:
-        run = _start(indices, slam, dense.put if sink else None, observer, keep_tracks)
-        return run.all_frames(fronts)
+    record = _begin(indices, record)
+    record.latencies = [] if clock is not None else None
+    with ExitStack() as threads:
+        dense = threads.enter_context(Consumer(consume, "dense", LIVE_SNAPSHOTS_AHEAD, DENSE_NICENESS)) if consume else None
+        adjuster: Errand[WindowAdjustment] = Errand("adjustment", ADJUSTMENT_NICENESS)
+        slam.adjuster = threads.enter_context(adjuster)
+        threads.callback(setattr, slam, "adjuster", AdjustAtOnce())
+        fronts = threads.enter_context(_fronts_ahead(threads, _pictures(dataset, indices), front_end, clock))
+        if clock is not None:
+            threads.callback(clock.cancel)
+        run = _Run(slam, record, observer or SilentObserver(), _hand_or_drop(slam, record, dense), clock)
+        run.all_frames(fronts)
+        record.adjustments_skipped = slam.adjustments_skipped
+        return record
 
 
-def run_ahead(source: Iterator[Any]) -> Iterator[Any]:
+def run_ahead(source: Iterator[Any], name: str, niceness: int = 0) -> Iterator[Any]:
     """The items of a generator, computed on a thread of its own a few items ahead; what it raises comes out here."""
-    with _ReadAhead(source) as items:
+    with ReadAhead(source, name, READ_AHEAD, niceness) as items:
         yield from items
 
 
-def _start(indices: range, slam: Slam, sink: SnapshotSink | None, observer: Observer | None, keep_tracks: bool) -> _Run:
+def _begin(indices: range, record: RunRecord | None) -> RunRecord:
     cv2.setNumThreads(1)
-    record = RunRecord(num_frames=len(indices), tracks=[] if keep_tracks else None)
-    return _Run(slam, record, observer or SilentObserver(), sink)
+    record = record if record is not None else RunRecord()
+    record.num_frames = len(indices)
+    return record
 
 
-def _front_frames(dataset: Dataset, indices: range, front_end: FrontEnd) -> Iterator[FrontEndFrame | Unreadable]:
+def _pictures(dataset: Dataset, indices: range) -> Iterator[Frame | Unreadable]:
     for index in indices:
-        frame = dataset.read(index)
-        yield frame if isinstance(frame, Unreadable) else front_end.process(frame)
+        with step(f"reading picture {index}"):
+            frame = dataset.read(index)
+        yield frame
 
 
-class _Stopped(Exception):
-    """The other end of a queue is gone."""
+def _front_frames(
+    pictures: Iterable[Frame | Unreadable], front_end: FrontEnd, clock: Clock | None = None
+) -> Iterator[FrontEndFrame | Unreadable]:
+    for picture in pictures:
+        if isinstance(picture, Unreadable):
+            yield picture
+            continue
+        if clock is not None:
+            clock.wait_for(picture.timestamp_ns)
+        with step(f"curvature and flow of frame {picture.index}"):
+            front = front_end.process(picture)
+        yield front
 
 
-class _Channel:
-    """A bounded queue that either end can close; then the other end's next call raises `_Stopped`."""
-
-    def __init__(self, size: int) -> None:
-        self._queue: queue.Queue[Any] = queue.Queue(maxsize=size)
-        self.closed = threading.Event()
-
-    def put(self, item: Any) -> None:
-        while not self.closed.is_set():
-            try:
-                return self._queue.put(item, timeout=0.1)
-            except queue.Full:
-                continue
-        raise _Stopped
-
-    def get(self) -> Any:
-        while True:
-            try:
-                return self._queue.get(timeout=0.1)
-            except queue.Empty:
-                if self.closed.is_set():
-                    raise _Stopped from None
+def _fronts_ahead(threads: ExitStack, pictures: Iterator[Frame | Unreadable], front_end: FrontEnd, clock: Clock | None) -> ReadAhead:
+    decoded = threads.enter_context(ReadAhead(pictures, "decoding", READ_AHEAD))
+    return ReadAhead(_front_frames(decoded, front_end, clock), "front-end", READ_AHEAD)
 
 
-_END = object()
+def _each_to(sink: SnapshotSink) -> SnapshotConsumer:
+    def consume(snapshots: Iterator[MapSnapshot]) -> None:
+        for snapshot in snapshots:
+            with step(f"meshing and fusing frame {snapshot.frame.index}"):
+                sink(snapshot)
+
+    return consume
 
 
-class _ReadAhead:
-    """Iterates a generator on a thread of its own, at most READ_AHEAD items ahead; its exception comes out here."""
+def _hand_to(slam: Slam, record: RunRecord, sink: SnapshotSink | None) -> KeyframeHand:
+    """Every keyframe goes to `sink`, which may take its time."""
 
-    def __init__(self, source: Iterator[Any]) -> None:
-        self._source, self._channel = source, _Channel(READ_AHEAD)
-        self._error: BaseException | None = None
-        self._thread = threading.Thread(target=self._work, name="vitamin3d-front-end", daemon=True)
+    def hand(keyframe: int, frame: Frame, _: bool) -> None:
+        if sink is not None:
+            record.keyframes_offered += 1
+            with step(f"meshing and fusing frame {frame.index}"):
+                sink(slam.snapshot(keyframe, frame))
 
-    def __enter__(self) -> "_ReadAhead":
-        self._thread.start()
-        return self
+    return hand
 
-    def __exit__(self, *_: object) -> None:
-        self._channel.closed.set()
-        self._thread.join()
 
-    def __iter__(self) -> Iterator[Any]:
-        while (item := self._channel.get()) is not _END:
-            yield item
-        if self._error is not None:
-            raise self._error
+def _hand_or_drop(slam: Slam, record: RunRecord, dense: Consumer | None) -> KeyframeHand:
+    """A keyframe for which the dense half has no room is dropped, unless the recording is over."""
 
-    def _work(self) -> None:
-        try:
-            for item in self._source:
-                self._channel.put(item)
-        except _Stopped:
+    def hand(keyframe: int, frame: Frame, is_over: bool) -> None:
+        if dense is None:
             return
-        except BaseException as error:
-            self._error = error
-        try:
-            self._channel.put(_END)
-        except _Stopped:
-            return
+        record.keyframes_offered += 1
+        if is_over or dense.has_room:
+            dense.put(slam.snapshot(keyframe, frame))
+        else:
+            record.keyframes_dropped += 1
 
-
-class _Worker:
-    """Calls a function on a thread of its own, item by item; its exception comes out of `put` or at the end."""
-
-    def __init__(self, size: int, function: Callable[[Any], None] | None) -> None:
-        self._function, self._channel = function, _Channel(size)
-        self._error: BaseException | None = None
-        self._thread = threading.Thread(target=self._work, name="vitamin3d-dense", daemon=True)
-
-    def __enter__(self) -> "_Worker":
-        self._thread.start()
-        return self
-
-    def __exit__(self, kind: type[BaseException] | None, *_: object) -> None:
-        with contextlib.suppress(_Stopped):
-            self._channel.put(_END)
-        self._thread.join()
-        if self._error is not None and (kind is None or kind is _Stopped):
-            raise self._error
-
-    def put(self, item: Any) -> None:
-        self._channel.put(item)
-
-    def _work(self) -> None:
-        try:
-            while (item := self._channel.get()) is not _END:
-                if self._function is not None:
-                    self._function(item)
-        except BaseException as error:
-            self._error = error
-        finally:
-            self._channel.closed.set()
+    return hand
 
 
 def median_of(values: list[int]) -> float:

@@ -28,6 +28,7 @@ from vitamin3d.mapping.pose_log import PoseLog
 from vitamin3d.mapping.relocalization import relocalize
 from vitamin3d.mapping.sparse_map import SparseMap
 from vitamin3d.mapping.two_view_initialization import initialize_from_two_views
+from vitamin3d.mapping.window_adjustment import AdjustAtOnce, Adjuster, WindowAdjustment, store_adjustment
 from vitamin3d.mapping.window_selection import Window, build_problem, select_frame_window, select_window, store_solution, whole_map
 from vitamin3d.tracking.extrema import refine_extrema, select_free_extrema
 from vitamin3d.tracking.extrema_tracking import predict_by_dense_flow, predict_by_dominant_flow, track_extrema
@@ -51,14 +52,18 @@ class Slam:
         self.times = StepTimes()
         self.initialization_reason, self.initialization_retries = "no frame was read", 0
         self.calibration = CalibrationRefinement(camera, config.calibration)
+        self.adjuster: Adjuster = AdjustAtOnce()
+        self.adjustments_skipped = 0
         self._history = InitializationHistory(config.initialization)
         self._pending_frames: dict[int, Frame] = {}
         self._meetings: list[Array] = []
         self._next_id = 0
         self._frame_count = 0
+        self._newest_frame = -1
 
     def process_frame(self, front: FrontEndFrame) -> SlamState:
         """One frame, from its curvature and flow to an adjusted map."""
+        self.take_adjustment()
         with self._timed("track_extrema"):
             self.tracks = self._track(front)
         if self.state is SlamState.INITIALIZING:
@@ -73,6 +78,7 @@ class Slam:
                 with self._timed("map"):
                     self._map(front, T_cam_world)
         self._frame_count += 1
+        self._newest_frame = front.frame.index
         return self.state
 
     # --- tracking (Sec. 2) -------------------------------------------------------------------------------------
@@ -252,12 +258,26 @@ class Slam:
             self.tracks = self.tracks.renamed(pairs[:, 1], pairs[:, 0])
 
     def _adjust_window(self) -> None:
-        """The keyframe's adjustment of the window and its landmarks, anchored; outliers leave the map and the tracks."""
+        """The keyframe's adjustment of the window and its landmarks, anchored; skipped while the one before is not done."""
+        if self.adjuster.is_busy:
+            self.adjustments_skipped += 1
+            return
+        window = select_window(self.map, self.config.window)
+        problem = build_problem(self.map, window)
+        self.adjuster.begin(lambda: self._solved(window, problem))
+        self.take_adjustment()
+
+    def _solved(self, window: Window, problem: BundleProblem) -> WindowAdjustment:
+        """Runs on the adjuster's thread."""
         with self._timed("bundle_adjustment_keyframe"):
-            window = select_window(self.map, self.config.window)
-            solved, _ = adjust_bundle(build_problem(self.map, window), self.camera, self.config.bundle_adjustment)
-            store_solution(self.map, window, solved)
-            self._remove_outliers(window, solved, self.config.bundle_adjustment.outlier_px)
+            return WindowAdjustment(window, adjust_bundle(problem, self.camera, self.config.bundle_adjustment)[0])
+
+    def take_adjustment(self, wait: bool = False) -> None:
+        """The window that was adjusted meanwhile enters the map; its outliers leave the map and the tracks."""
+        done = self.adjuster.take(wait)
+        if done is not None:
+            store_adjustment(self.map, done)
+            self._remove_outliers(done.window, done.solved, self.config.bundle_adjustment.outlier_px)
 
     def _refine_calibration_when_due(self) -> None:
         if self.calibration.is_due(self.map.num_keyframes):
@@ -307,9 +327,11 @@ class Slam:
     # --- what leaves ---------------------------------------------------------------------------------------------
 
     def take_settled_keyframes(self, everything: bool = False) -> list[tuple[int, Frame]]:
-        """The keyframes that left the window since the last call (or all that remain), each once, with their frames."""
-        settled = self.map.num_keyframes - (0 if everything else self.config.window.keyframes)
-        ready = sorted(k for k in self._pending_frames if k < settled)
+        """The keyframes that settled since the last call (or all that remain), each once, with their frames."""
+        window, count = self.config.window, self.map.num_keyframes
+        settled = count if everything else count - (window.settled_keyframes or window.keyframes)
+        rests_since = self._newest_frame - window.settled_frames if window.settled_frames else -1
+        ready = sorted(k for k, frame in self._pending_frames.items() if k < settled or frame.index <= rests_since)
         return [(k, self._pending_frames.pop(k)) for k in ready]
 
     def snapshot(self, keyframe: int, frame: Frame) -> MapSnapshot:

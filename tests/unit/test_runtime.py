@@ -9,7 +9,8 @@ import pytest
 
 from vitamin3d.config import Config, WindowConfig
 from vitamin3d.datasets.pictures import Unreadable
-from vitamin3d.runtime import SilentObserver, median_of, run_sequential, run_threaded
+from vitamin3d.errors import WorkerError
+from vitamin3d.runtime import RunRecord, SilentObserver, median_of, run_sequential, run_threaded
 from vitamin3d.slam import Slam
 from vitamin3d.tracking.front_end import FrontEnd
 from vitamin3d.types import SlamState
@@ -63,7 +64,7 @@ def no_thread_is_left():
 
 
 def test_threads_change_nothing(demo):
-    (a, record_a), (b, record_b) = (run(name, demo, demo.camera, 40, keep_tracks=True) for name in RUNS)
+    (a, record_a), (b, record_b) = (run(name, demo, demo.camera, 40, record=RunRecord(tracks=[])) for name in RUNS)
     assert a.map.num_keyframes >= 3 and len(a.trajectory()) > 30
     np.testing.assert_array_equal(a.trajectory().T_world_cam, b.trajectory().T_world_cam)
     np.testing.assert_array_equal(a.trajectory().timestamps_ns, b.trajectory().timestamps_ns)
@@ -105,8 +106,9 @@ def test_an_exception_of_the_dense_half_comes_out(demo, name):
     def sink(snapshot):
         raise MemoryError("no room for a voxel")
 
-    with pytest.raises(MemoryError, match="no room"):
+    with pytest.raises(WorkerError, match=r"meshing and fusing frame \d+: MemoryError: no room") as caught:
         run(name, demo, demo.camera, sink=sink)
+    assert isinstance(caught.value.__cause__, MemoryError)
 
 
 def test_an_exception_at_the_very_last_keyframe_comes_out(demo):
@@ -118,13 +120,13 @@ def test_an_exception_at_the_very_last_keyframe_comes_out(demo):
             time.sleep(0.2)
             raise ValueError("late")
 
-    with pytest.raises(ValueError, match="late"):
+    with pytest.raises(WorkerError, match="ValueError: late"):
         run("threaded", demo, demo.camera, sink=sink)
 
 
 @pytest.mark.parametrize("name", list(RUNS))
 def test_an_exception_of_the_dataset_comes_out(demo, name):
-    with pytest.raises(RuntimeError, match="fell off"):
+    with pytest.raises(WorkerError, match="reading picture 17: RuntimeError: the disk fell off"):
         run(name, Spoilt(demo, fails_at=17), demo.camera, 30)
 
 

@@ -48,7 +48,8 @@ def reconstruct(
     voxel_high: Annotated[float | None, typer.Option(help="Fine voxels, metres; needs a scale.")] = None,
     metric_scale: Annotated[float | None, typer.Option(help="Metres per map unit.")] = None,
     scale_from_ground_truth: Annotated[bool, typer.Option("--scale-from-ground-truth", help="Take the scale from it.")] = False,
-    live: Annotated[bool, typer.Option("--live", help="Fuse while tracking, without the final adjustment of the map before.")] = False,
+    live: Annotated[bool, typer.Option("--live", help="Fuse while tracking; keyframes there is no time for are not meshed.")] = False,
+    realtime: Annotated[bool, typer.Option("--realtime", help="--live, and pictures come when their time stamps say.")] = False,
     save_tracks: Annotated[bool, typer.Option("--save-tracks", help="Also write tracks.npz.")] = False,
     overwrite: Annotated[bool, typer.Option("--overwrite", help="Replace an earlier result.")] = False,
     quiet: Annotated[bool, typer.Option("--quiet", "-q", help="Warnings and the result only.")] = False,
@@ -57,14 +58,16 @@ def reconstruct(
     one_thread_each()
     from vitamin3d.job import Job, Selection
 
+    voxels = _voxels(voxel_low, voxel_high, metric_scale, scale_from_ground_truth)
     job = Job(
-        _settings(mode, config, seed, refine_calibration, _voxels(voxel_low, voxel_high, metric_scale, scale_from_ground_truth)),
+        _settings(_named(mode, live or realtime), config, seed, refine_calibration, voxels),
         Selection(start, max_frames, stride),
         threads,
         metric_scale,
         scale_from_ground_truth,
         save_tracks,
-        live,
+        live or realtime,
+        realtime,
     )
     try:
         code = _run(source, calibration, job, out, overwrite, quiet)
@@ -74,17 +77,21 @@ def reconstruct(
     raise typer.Exit(code)
 
 
-def show_config(mode: Annotated[Mode, typer.Option(help="Which named settings.")] = Mode.default) -> None:
+def show_config(
+    mode: Annotated[Mode, typer.Option(help="Which named settings.")] = Mode.default,
+    live: Annotated[bool, typer.Option("--live", help="As --live changes them.")] = False,
+) -> None:
     """Print all settings as TOML, for --config."""
     from vitamin3d.config import dump_toml
 
-    typer.echo(dump_toml(_named(mode)), nl=False)
+    typer.echo(dump_toml(_named(mode, live)), nl=False)
 
 
-def _named(mode: Mode) -> "Config":
-    from vitamin3d.config import Config, paper_config
+def _named(mode: Mode, live: bool) -> "Config":
+    from vitamin3d.config import Config, live_config, paper_config
 
-    return paper_config() if mode is Mode.paper else Config()
+    config = paper_config() if mode is Mode.paper else Config()
+    return live_config(config) if live else config
 
 
 def _voxels(low: float | None, high: float | None, metric_scale: float | None, from_truth: bool) -> dict[str, Any]:
@@ -100,12 +107,12 @@ def _voxels(low: float | None, high: float | None, metric_scale: float | None, f
     return given
 
 
-def _settings(mode: Mode, path: Path | None, seed: int | None, refine: Refine | None, voxels: dict[str, Any]) -> "Config":
+def _settings(base: "Config", path: Path | None, seed: int | None, refine: Refine | None, voxels: dict[str, Any]) -> "Config":
     import dataclasses
 
     from vitamin3d.config import load_toml
 
-    config = _named(mode) if path is None else load_toml(path, _named(mode))
+    config = base if path is None else load_toml(path, base)
     config = config if seed is None else dataclasses.replace(config, seed=seed)
     if refine is not None:
         config = dataclasses.replace(config, calibration=dataclasses.replace(config.calibration, refine=refine.value))
@@ -118,14 +125,15 @@ def _run(source: Path, calibration: Path | None, job: "Job", out: Path, overwrit
     from vitamin3d.datasets import open_dataset
     from vitamin3d.exporters.output_folder import OutputFolder
     from vitamin3d.job import reconstruct_sequence
-    from vitamin3d.progress import ConsoleObserver
+    from vitamin3d.progress import ConsoleObserver, warmed_up
 
     dataset = open_dataset(source, calibration)
     job.selection.indices(len(dataset))
     output = OutputFolder(out, overwrite)
+    if not kernels_are_cached():
+        typer.echo("first run: the numerical kernels are being compiled, once; this takes about a minute", err=True)
+        warmed_up()
     with ConsoleObserver(quiet) as observer:
-        if not kernels_are_cached():
-            observer.line("first run: the numerical kernels are being compiled, once; this takes about a minute")
         outcome = reconstruct_sequence(dataset, job, output, observer)
     return _conclude(outcome, out)
 
@@ -139,6 +147,8 @@ def _conclude(outcome: "Outcome", out: Path) -> int:
         f"{stats['tracked_frames']} of {stats['frames']} frames localised, {stats['keyframes']} keyframes, "
         f"{stats['cloud_points']} points, {stats['wall_seconds']:.0f} s; {outcome.scale.remark}"
     )
+    if stats["live"]:
+        typer.echo(_live_line(stats["live"]))
     if stats["calibration"]["refined"]:
         given, used = stats["calibration"]["given"], stats["calibration"]["used"]
         typer.echo(
@@ -149,3 +159,13 @@ def _conclude(outcome: "Outcome", out: Path) -> int:
         if (out / name).exists():
             typer.echo(f"  {out / name}")
     return EXIT_INTERRUPTED if outcome.record.interrupted else 0
+
+
+def _live_line(live: dict[str, Any]) -> str:
+    """What a live run left out and what came late."""
+    line = f"live: {live['keyframes_dropped']} of {live['keyframes_offered']} keyframes not meshed for lack of time"
+    if "realtime" not in live:
+        return line
+    late, lag = live["realtime"], live["realtime"]["mesh_lag_seconds"]
+    line += f"; {len(late['late_frames'])} frames late ({100 * late['late_share']:.1f} %), the worst {late['latency_ms']['worst']:.0f} ms"
+    return line + (f"; the mesh {lag['median']:.1f} s behind the camera, at most {lag['worst']:.1f} s" if lag else "")

@@ -35,6 +35,11 @@ class NeighbourQueue(Generic[Item]):
         """Those that still wait: none will follow."""
         return self._taken(self._first + len(self._items))
 
+    def clear(self) -> None:
+        """Drops those that wait."""
+        self._first += len(self._items)
+        self._next, self._items = max(self._next, self._first), []
+
     def _taken(self, end: int) -> list[Around[Item]]:
         ready = []
         while self._next < end:
