@@ -261,6 +261,18 @@ class CalibrationConfig:
 
 
 @dataclass(frozen=True)
+class MemoryConfig:
+    """When a map is condensed, so that a run without end fits into memory."""
+
+    max_keyframes: int = 1200
+    """Above it, keyframes whose landmarks others see too are dropped."""
+    dropped_share: float = 0.15
+    """Of max_keyframes, at a time."""
+    max_new_tracks: int = 1_000_000
+    """When so many were born, those that ended and are no landmarks are forgotten."""
+
+
+@dataclass(frozen=True)
 class CloudConfig:
     """Filter of the exported cloud."""
 
@@ -419,6 +431,7 @@ class Config:
     bundle_adjustment: BundleAdjustmentConfig = field(default_factory=BundleAdjustmentConfig)
     final_adjustment: FinalAdjustmentConfig = field(default_factory=FinalAdjustmentConfig)
     calibration: CalibrationConfig = field(default_factory=CalibrationConfig)
+    memory: MemoryConfig = field(default_factory=MemoryConfig)
     cloud: CloudConfig = field(default_factory=CloudConfig)
     snapshot: SnapshotConfig = field(default_factory=SnapshotConfig)
     densification: DensificationConfig = field(default_factory=DensificationConfig)
@@ -450,7 +463,7 @@ def paper_config() -> Config:
 
 
 def live_config(base: Config) -> Config:
-    """`base` for cameras that do not wait: fewer keyframes, smaller windows, meshes of landmarks alone, fused soon after they were seen.
+    """`base` for cameras that do not wait: fewer keyframes, smaller windows, and meshes made soon after their pictures.
 
     Nothing is adjusted again at the end: the mesh is there already. The volume is ours, since Open3D's lets no other thread run
     while it integrates a view.
@@ -459,12 +472,13 @@ def live_config(base: Config) -> Config:
     return change(
         base,
         keyframes=change(base.keyframes, motion_px=20.0),
-        window=change(base.window, keyframes=10, anchors=min(20, base.window.anchors), settled_keyframes=5, settled_frames=15),
+        window=change(base.window, keyframes=10, anchors=min(20, base.window.anchors), settled_keyframes=3, settled_frames=15),
         bundle_adjustment=change(base.bundle_adjustment, keyframe_iterations=3, sweeps_per_frame=0),
         final_adjustment=change(base.final_adjustment, enabled=False),
         calibration=change(base.calibration, refine="off"),
-        densification=change(base.densification, enabled=False),
-        consistency=change(base.consistency, near=1, far=2),
+        memory=change(base.memory, max_keyframes=600, max_new_tracks=60_000),
+        densification=change(base.densification, reach=4, planes=32),
+        consistency=change(base.consistency, near=1, far=1),
         fusion=change(base.fusion, keyframes_for_depth=10, backend="blocks"),
     )
 

@@ -24,7 +24,7 @@ from vitamin3d.types import Array, Frame, FrontEndFrame, MapSnapshot, SlamState
 from vitamin3d.workers import Clock, Consumer, Errand, ReadAhead, step
 
 READ_AHEAD = 4
-SNAPSHOTS_AHEAD, LIVE_SNAPSHOTS_AHEAD = 8, 2
+SNAPSHOTS_AHEAD, LIVE_SNAPSHOTS_AHEAD = 8, 3
 ADJUSTMENT_NICENESS, DENSE_NICENESS = 3, 10
 """In live runs the front end comes first, then the map, then the mesh."""
 
@@ -126,7 +126,7 @@ class _Run:
         seen = self.slam.tracks.select(self.slam.tracks.missed == 0)
         self.record.live_tracks.append(len(seen))
         if self.record.tracks is not None:
-            self.record.tracks.append((frame_index, seen.ids, seen.pixels))
+            self.record.tracks.append((frame_index, self.slam.unique_ids(seen.ids), seen.pixels))
 
 
 def run_sequential(

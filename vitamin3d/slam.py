@@ -22,6 +22,7 @@ from vitamin3d.mapping.keyframe_selection import is_keyframe
 from vitamin3d.mapping.landmark_recovery import cut_patches, patch_similarity, recover_landmarks, same_landmarks
 from vitamin3d.mapping.landmark_statistics import keyframe_vertices
 from vitamin3d.mapping.landmark_triangulation import triangulate_landmarks
+from vitamin3d.mapping.map_condensation import condense, is_due
 from vitamin3d.mapping.map_initialization import add_view, build_first_map
 from vitamin3d.mapping.p3p_localization import localize
 from vitamin3d.mapping.pose_log import PoseLog
@@ -58,12 +59,14 @@ class Slam:
         self._pending_frames: dict[int, Frame] = {}
         self._meetings: list[Array] = []
         self._next_id = 0
+        self._unique_ids, self._num_condensed, self._num_forgotten = np.zeros(0, np.int64), 0, 0
         self._frame_count = 0
         self._newest_frame = -1
 
     def process_frame(self, front: FrontEndFrame) -> SlamState:
         """One frame, from its curvature and flow to an adjusted map."""
         self.take_adjustment()
+        self._condense_when_due()
         with self._timed("track_extrema"):
             self.tracks = self._track(front)
         if self.state is SlamState.INITIALIZING:
@@ -278,6 +281,31 @@ class Slam:
         if done is not None:
             store_adjustment(self.map, done)
             self._remove_outliers(done.window, done.solved, self.config.bundle_adjustment.outlier_px)
+
+    def _condense_when_due(self) -> None:
+        """Once in a while the map forgets what it can do without; ids and keyframes are numbered anew."""
+        new_ids = self._next_id - self._num_condensed
+        if self.state is SlamState.INITIALIZING or not is_due(self.map, new_ids, self.config.memory):
+            return
+        with self._timed("condense"):
+            self.take_adjustment(wait=True)
+            needed = np.concatenate([self.tracks.ids, *(pair.ravel() for pair in self._meetings)])
+            done = condense(self.map, np.unique(needed), UNTAKEN_WINDOWS * self.config.window.keyframes, self.config.memory)
+            self.poses.move_to(done.kept_keyframes, self.map)
+            self._unique_ids = self.unique_ids(done.kept_ids)
+            self._num_forgotten = self.unique_ids(np.array([self._next_id]))[0] - len(done.kept_ids)
+            renamed = np.searchsorted(done.kept_ids, self.tracks.ids)
+            self.tracks = replace(self.tracks, ids=renamed)
+            self._meetings = [np.searchsorted(done.kept_ids, pair) for pair in self._meetings]
+            self._pending_frames = {int(np.searchsorted(done.kept_keyframes, k)): f for k, f in self._pending_frames.items()}
+            self.map, self._next_id, self._num_condensed = done.map, len(done.kept_ids), len(done.kept_ids)
+
+    def unique_ids(self, ids: Array) -> Array:
+        """The ids (N,) that tracks had at their birth, which the map's memory does not reuse."""
+        known = ids < self._num_condensed
+        out = ids + self._num_forgotten
+        out[known] = self._unique_ids[ids[known]]
+        return np.asarray(out)
 
     def _refine_calibration_when_due(self) -> None:
         if self.calibration.is_due(self.map.num_keyframes):

@@ -4,7 +4,7 @@
 import numpy as np
 
 from vitamin3d.geometry.se3 import inverse
-from vitamin3d.mapping.sparse_map import SparseMap
+from vitamin3d.mapping.sparse_map import GrowingArray, SparseMap
 from vitamin3d.types import Array, Frame, Trajectory
 
 
@@ -12,15 +12,21 @@ class PoseLog:
     """Frames in the order in which they were localised; the last two make the motion model."""
 
     def __init__(self) -> None:
-        self._entries: dict[int, tuple[int, int, Array]] = {}
+        self._row_of_frame: dict[int, int] = {}
+        self._frames, self._stamps, self._keyframes = (GrowingArray((), np.int64, -1) for _ in range(3))
+        self._T_cam_keyframe = GrowingArray((4, 4), np.float64, 0.0)
         self._last: list[int] = []
 
     def __len__(self) -> int:
-        return len(self._entries)
+        return len(self._row_of_frame)
 
     def add(self, frame: Frame, keyframe: int, T_cam_keyframe: Array) -> None:
         """Logs a frame by its pose relative to a keyframe (the identity for the keyframe itself)."""
-        self._entries[frame.index] = (frame.timestamp_ns, keyframe, T_cam_keyframe)
+        row = self._row_of_frame.setdefault(frame.index, len(self._row_of_frame))
+        values = ((self._frames, frame.index), (self._stamps, frame.timestamp_ns), (self._keyframes, keyframe))
+        for array, value in (*values, (self._T_cam_keyframe, T_cam_keyframe)):
+            array.resize(row + 1)
+            array.view[row] = value
         self._last = [*self._last[-1:], frame.index]
 
     def add_world(self, frame: Frame, T_cam_world: Array, sparse_map: SparseMap) -> None:
@@ -30,8 +36,8 @@ class PoseLog:
 
     def pose(self, frame_index: int, sparse_map: SparseMap) -> Array:
         """T_cam_world (4, 4) of a logged frame as the map stands now."""
-        _, keyframe, T_cam_keyframe = self._entries[frame_index]
-        return np.asarray(T_cam_keyframe @ sparse_map.T_cam_world[keyframe])
+        row = self._row_of_frame[frame_index]
+        return np.asarray(self._T_cam_keyframe.view[row] @ sparse_map.T_cam_world[self._keyframes.view[row]])
 
     def predict(self, sparse_map: SparseMap) -> Array:
         """T_cam_world (4, 4) of the next frame, moving on as between the last two."""
@@ -40,9 +46,23 @@ class PoseLog:
             return newest
         return np.asarray(newest @ inverse(self.pose(self._last[0], sparse_map)) @ newest)
 
+    def move_to(self, kept_keyframes: Array, sparse_map: SparseMap) -> None:
+        """Keyframes are numbered anew, in their order; what hung on one that leaves hangs on the one before it.
+
+        Args:
+            kept_keyframes: (K',) old numbers, the first among them.
+            sparse_map: with the old numbers.
+        """
+        old = self._keyframes.view
+        new = np.searchsorted(kept_keyframes, old, side="right") - 1
+        heirs = kept_keyframes[new]
+        moved = np.flatnonzero(heirs != old)
+        poses = sparse_map.T_cam_world
+        self._T_cam_keyframe.view[moved] = self._T_cam_keyframe.view[moved] @ poses[old[moved]] @ inverse(poses[heirs[moved]])
+        self._keyframes.view[:] = new
+
     def trajectory(self, sparse_map: SparseMap) -> Trajectory:
         """Camera-to-world poses of all logged frames, by time."""
-        indices = sorted(self._entries)
-        stamps = np.array([self._entries[i][0] for i in indices], np.int64)
-        poses = [inverse(self.pose(i, sparse_map)) for i in indices]
-        return Trajectory(stamps, np.array(poses).reshape(-1, 4, 4))
+        order = np.argsort(self._frames.view)
+        poses = self._T_cam_keyframe.view[order] @ sparse_map.T_cam_world[self._keyframes.view[order]]
+        return Trajectory(self._stamps.view[order], inverse(poses))

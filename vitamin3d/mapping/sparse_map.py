@@ -45,7 +45,7 @@ def _relabel(starts, obs_landmark, obs_valid, first, new_id, is_target, count, f
                 last_new[target] = i
 
 
-class _Growing:
+class GrowingArray:
     """An array whose first axis grows by doubling; `view` is the used part."""
 
     def __init__(self, shape: tuple[int, ...], dtype: type, fill: float) -> None:
@@ -77,16 +77,16 @@ class SparseMap:
         self.frame_indices: list[int] = []
         self.timestamps_ns: list[int] = []
         self.keyframe_starts: list[int] = [0]
-        self._poses = _Growing((4, 4), np.float64, 0.0)
-        self._obs_landmark = _Growing((), np.int64, -1)
-        self._obs_pixels = _Growing((2,), np.float64, np.nan)
-        self._obs_valid = _Growing((), np.bool_, False)
-        self._points = _Growing((3,), np.float64, np.nan)
-        self._first = _Growing((), np.int64, -1)
-        self._last = _Growing((), np.int64, -1)
-        self._count = _Growing((), np.int32, 0)
-        self._colors = _Growing((3,), np.uint8, 0)
-        self._patches = _Growing((PATCH_PX * PATCH_PX,), np.uint8, 0)
+        self._poses = GrowingArray((4, 4), np.float64, 0.0)
+        self._obs_landmark = GrowingArray((), np.int64, -1)
+        self._obs_pixels = GrowingArray((2,), np.float64, np.nan)
+        self._obs_valid = GrowingArray((), np.bool_, False)
+        self._points = GrowingArray((3,), np.float64, np.nan)
+        self._first = GrowingArray((), np.int64, -1)
+        self._last = GrowingArray((), np.int64, -1)
+        self._count = GrowingArray((), np.int32, 0)
+        self._colors = GrowingArray((3,), np.uint8, 0)
+        self._patches = GrowingArray((PATCH_PX * PATCH_PX,), np.uint8, 0)
 
     @property
     def num_keyframes(self) -> int:
@@ -234,6 +234,58 @@ class SparseMap:
         )
         self._count.view[kept], self._first.view[kept], self._last.view[kept] = count[kept], first[kept], last[kept]
         self.remove_landmarks(gone)
+
+    def condensed(self, keyframes: Array, needed_ids: Array) -> tuple["SparseMap", Array]:
+        """A copy with some keyframes only, and without what counts no more; ids and keyframes are numbered anew in their order.
+
+        Args:
+            keyframes: (K',) ascending, that stay.
+            needed_ids: (N,) tracks that stay whether they are landmarks or not; may be larger than any in the map.
+
+        Returns:
+            The copy, and (I',) the old ids that have new ones, ascending; the new id is the position.
+        """
+        size = len(self.points_world)
+        stays = np.zeros(self.num_keyframes, np.bool_)
+        stays[keyframes] = True
+        first = self.first_observation[self.obs_landmark]
+        counts = self.obs_valid & (first >= 0) & (np.arange(len(first)) >= first) & np.repeat(stays, np.diff(self.keyframe_starts))
+        count = np.bincount(self.obs_landmark[counts], minlength=size)
+        is_landmark = ~np.isnan(self.points_world[:, 0]) & (count >= 2)
+        kept = np.union1d(np.flatnonzero(is_landmark), needed_ids)
+        known = kept[kept < size]
+        new_id = np.full(size, -1, np.int64)
+        new_id[known] = np.arange(len(known))
+        counts &= new_id[self.obs_landmark] >= 0
+        copy = self._copy_of(keyframes, counts, new_id)
+        for name, array in (("_points", self._points), ("_colors", self._colors), ("_patches", self._patches)):
+            getattr(copy, name).append(array.view[known])
+        copy._points.view[~is_landmark[known]] = np.nan
+        copy._index_observations(len(known))
+        return copy, kept
+
+    def _copy_of(self, keyframes: Array, counts: Array, new_id: Array) -> "SparseMap":
+        """Some keyframes with the observations `counts` (M,) bool, ids renamed; no landmarks yet."""
+        copy = SparseMap()
+        copy.frame_indices = [self.frame_indices[k] for k in keyframes]
+        copy.timestamps_ns = [self.timestamps_ns[k] for k in keyframes]
+        copy._poses.append(self.T_cam_world[keyframes])
+        copy._obs_landmark.append(new_id[self.obs_landmark[counts]])
+        copy._obs_pixels.append(self.obs_pixels[counts])
+        copy._obs_valid.append(np.ones(int(counts.sum()), np.bool_))
+        before = np.concatenate([[0], np.cumsum(counts)])[self.keyframe_starts]
+        copy.keyframe_starts = [0, *np.cumsum(np.diff(before)[keyframes]).tolist()]
+        return copy
+
+    def _index_observations(self, size: int) -> None:
+        """Counts, first and last of the observations, all of which count."""
+        rows = np.arange(len(self.obs_landmark))
+        count, last, first = np.bincount(self.obs_landmark, minlength=size), np.full(size, -1, np.int64), np.full(size, -1, np.int64)
+        last[self.obs_landmark] = rows  # of equal indices the last assignment stays
+        first[self.obs_landmark[::-1]] = rows[::-1]
+        self._count.append(count.astype(np.int32))
+        self._last.append(last)
+        self._first.append(first)
 
     def clone_pose(self, keyframe: int) -> Array:
         """T_cam_world (4, 4) of a keyframe, a copy."""
