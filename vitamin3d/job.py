@@ -87,7 +87,8 @@ def reconstruct_sequence(dataset: Dataset, job: Job, output: OutputFolder, obser
     """
     run = _JobRun(dataset, job, output, observer)
     try:
-        run.reconstruct()
+        with step("reconstruction"):
+            run.reconstruct()
     except Exception as error:
         run.save_after(error)
         raise
@@ -117,6 +118,7 @@ class _JobRun:
         else:
             run = run_threaded if self.job.threads else run_sequential
             run(*source, self.dense.add if self.job.live else None, self.observer, self.record)
+        self.dense.finish()
         with step("final adjustment"):
             self.slam.finish()
         if self.slam.map.num_keyframes and not self.job.live:
@@ -236,7 +238,8 @@ class _Dense:
                 self._begun().fuse(view)
             if self.clock is not None:
                 self.mesh_lags.append(self.clock.seconds_since(view.timestamp_ns))
-            self.output.write_view(view, self.scale)
+            with step("writing depth and normal maps"):
+                self.output.write_view(view, self.scale)
             if done is not None:
                 done(view)
 
@@ -252,14 +255,19 @@ class _Dense:
             self.output.write_canvas(self.reconstruction.canvas, self.scale)
         return self.reconstruction
 
+    def finish(self) -> None:
+        """Fuses the keyframes that wait for neighbours."""
+        if self.reconstruction is not None:
+            with step("meshing and fusing the last keyframes"):
+                for view in self.reconstruction.finish():
+                    self.output.write_view(view, self.scale)
+
     def write_surfaces(self, is_broken: bool = False) -> None:
-        """Fuses what still waits (not where a step is broken), and writes the meshes."""
+        """Writes the meshes, without the keyframes that still wait where a step is broken."""
         if self.reconstruction is None:
             return
         if is_broken:
             self.reconstruction.forget_waiting()
-        for view in self.reconstruction.finish():
-            self.output.write_view(view, self.scale)
         if self.reconstruction.median_depths:
             self.output.write_surfaces(*self.reconstruction.surfaces(), self.scale, self.reconstruction.voxel_lengths())
 

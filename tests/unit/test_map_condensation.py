@@ -94,7 +94,7 @@ def test_too_many_keyframes_become_fewer(rng):
 
 def test_poses_stay_where_they_were(rng):
     made, log = some_map(rng), PoseLog()
-    for index in range(0, 115):
+    for index in range(115):
         pose = np.eye(4)
         pose[:3, 3] = rng.normal(size=3)
         log.add_world(Frame(index, 100 * index, np.zeros((2, 2), np.uint8)), pose, made)

@@ -10,10 +10,11 @@ import pytest
 from vitamin3d.config import Config, WindowConfig
 from vitamin3d.datasets.pictures import Unreadable
 from vitamin3d.errors import WorkerError
-from vitamin3d.runtime import RunRecord, SilentObserver, median_of, run_sequential, run_threaded
+from vitamin3d.runtime import RunRecord, SilentObserver, median_of, run_live, run_sequential, run_threaded
 from vitamin3d.slam import Slam
 from vitamin3d.tracking.front_end import FrontEnd
 from vitamin3d.types import SlamState
+from vitamin3d.workers import Clock
 
 CONFIG = Config(seed=3, window=WindowConfig(keyframes=2, anchors=3))  # a small window hands keyframes over early
 RUNS = {"sequential": run_sequential, "threaded": run_threaded}
@@ -182,3 +183,64 @@ def test_the_trajectory_is_near_the_truth(demo):
 
 def test_median_of():
     assert (median_of([]), median_of([3, 1, 8])) == (0.0, 3.0)
+
+
+def test_live_no_frame_waits_for_a_dense_half_that_does_not_keep_up(demo):
+    go, received = threading.Event(), []
+
+    def consume(snapshots):
+        go.wait(30)
+        received.extend(snapshot.frame.index for snapshot in snapshots)
+
+    class Opens(SilentObserver):
+        def frame_done(self, done, total, slam):
+            if done == 120:
+                go.set()
+
+    slam, record = Slam(demo.camera, CONFIG), RunRecord()
+    run_live(demo, range(120), FrontEnd(CONFIG), slam, consume, Opens(), record)
+    assert len(record.states) == 120 and len(slam.trajectory()) > 110
+    assert record.keyframes_offered == slam.map.num_keyframes and record.keyframes_dropped > 2
+    assert len(received) == record.keyframes_offered - record.keyframes_dropped
+    assert set(received) <= set(slam.map.frame_indices) and received == sorted(received)
+
+
+def test_live_windows_are_adjusted_beside_the_tracking(demo):
+    slam, record = Slam(demo.camera, CONFIG), RunRecord()
+    threads, solved = set(), slam._solved
+
+    def watched(window, problem):
+        threads.add(threading.current_thread().name)
+        time.sleep(0.15)
+        return solved(window, problem)
+
+    slam._solved = watched
+    run_live(demo, range(90), FrontEnd(CONFIG), slam, record=record)
+    assert threads == {"vitamin3d-adjustment"} and not slam.adjuster.is_busy
+    assert record.adjustments_skipped == slam.adjustments_skipped > 0
+    reference, _ = run("sequential", demo, demo.camera, 90)
+    a, b = (np.linalg.norm(np.diff(s.trajectory().T_world_cam[:, :3, 3], axis=0), axis=1).sum() for s in (slam, reference))
+    assert abs(a / b - 1) < 0.05
+
+
+def test_pictures_come_when_they_are_due(demo):
+    record, clock, begun = RunRecord(), Clock(), time.monotonic()
+    run_live(demo, range(30), FrontEnd(CONFIG), Slam(demo.camera, CONFIG), record=record, clock=clock)
+    span = (demo.timestamps_ns[29] - demo.timestamps_ns[0]) / 1e9
+    assert time.monotonic() - begun >= span
+    assert [index for index, _ in record.latencies] == list(range(30)) and all(0 < seconds < 10 for _, seconds in record.latencies)
+
+
+def test_a_stop_does_not_wait_for_the_next_picture(demo):
+    class Rare:
+        def read(self, index):
+            return dataclasses.replace(demo.read(index), timestamp_ns=index * 3600 * 10**9)
+
+    class StopsSoon(SilentObserver):
+        def should_stop(self):
+            raise KeyboardInterrupt
+
+    begun = time.monotonic()
+    with pytest.raises(KeyboardInterrupt):
+        run_live(Rare(), range(3), FrontEnd(CONFIG), Slam(demo.camera, CONFIG), observer=StopsSoon(), clock=Clock())
+    assert time.monotonic() - begun < 20
