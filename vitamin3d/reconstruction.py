@@ -2,9 +2,7 @@
 """The dense half of VITAMIN-E (Sec. 4.2): keyframes with landmark depths -> meshes in the image -> TSDF -> surface."""
 
 import dataclasses
-import time
 from collections.abc import Iterable, Iterator
-from contextlib import contextmanager
 from dataclasses import replace
 
 import numpy as np
@@ -98,7 +96,7 @@ class Reconstruction:
         for around in ready:
             snapshot = around.item.snapshot
             if self.config.densification.enabled:
-                with self._timed("densification"):
+                with self.times.timed("densification"):
                     snapshot = self._densifier.densify(around)
             view = self.depth_view(snapshot)
             if view is not None:
@@ -108,19 +106,19 @@ class Reconstruction:
         config = self.config.consistency
         if not config.enabled:
             return around.item
-        with self._timed("consistency"):
+        with self.times.timed("consistency"):
             sides = (side[k - 1] for side in (around.before, around.after) for k in (config.near, config.far) if k <= len(side))
             return doubted(around.item, list(sides), self.canvas, config.tolerance, config.contradicted_weight)
 
     def depth_view(self, snapshot: MapSnapshot) -> DepthView | None:
         """Meshes, denoises and renders a keyframe; None where it has too few landmarks."""
-        with self._timed("meshing"):
+        with self.times.timed("meshing"):
             mesh = triangulate(snapshot, self.config.delaunay)
         if mesh is None:
             return None
-        with self._timed("denoising"):
+        with self.times.timed("denoising"):
             denoised = denoise(mesh, self.config.nltgv)
-        with self._timed("rendering"):
+        with self.times.timed("rendering"):
             return self.renderer.render(snapshot, denoised.mesh, denoised.slopes)
 
     def fuse(self, view: DepthView) -> None:
@@ -134,9 +132,9 @@ class Reconstruction:
         """The coarse and the fine surface of all keyframes so far, those that still waited for neighbours included."""
         self.finish()
         self._fuse_waiting()
-        with self._timed("surface_low"):
+        with self.times.timed("surface_low"):
             low = self._surface(self.low)
-        with self._timed("surface_high"):
+        with self.times.timed("surface_high"):
             high = self._surface(self.high)
         return low, high
 
@@ -161,9 +159,9 @@ class Reconstruction:
         if self.low is None or self.high is None:
             self.low, self.high = (self._volume(length) for length in self.voxel_lengths())
         max_depth = self.config.fusion.max_depth * float(np.nanmedian(self.median_depths))
-        with self._timed("fusion_low"):
+        with self.times.timed("fusion_low"):
             self.low.integrate(view, self.canvas, max_depth)
-        with self._timed("fusion_high"):
+        with self.times.timed("fusion_high"):
             self.high.integrate(view, self.canvas, max_depth)
 
     def _volume(self, voxel_length: float) -> TsdfVolume:
@@ -177,9 +175,3 @@ class Reconstruction:
         coarser = volume.voxel_length / self.high.voxel_length
         least = round(self.config.surface.min_component_triangles / coarser**2)
         return clean(volume.extract_surface(), replace(self.config.surface, min_component_triangles=least))
-
-    @contextmanager
-    def _timed(self, step: str) -> Iterator[None]:
-        start = time.perf_counter()
-        yield
-        self.times.add(step, time.perf_counter() - start)

@@ -4,6 +4,7 @@
 import platform
 import resource
 import time
+from collections.abc import Sequence
 from importlib.metadata import PackageNotFoundError, version
 from typing import Any
 
@@ -34,7 +35,7 @@ def step_table(*times: StepTimes) -> dict[str, dict[str, float]]:
     return {step: _summary(values) for t in times for step, values in t.milliseconds.items()}
 
 
-def _summary(values: list[float]) -> dict[str, float]:
+def _summary(values: Sequence[float]) -> dict[str, float]:
     return {
         "count": len(values),
         "median_ms": round(float(np.median(values)), 3),

@@ -1,9 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """Tracking, localisation and mapping on one page (Fig. 2a–b of the paper): `Slam.process_frame`, top to bottom."""
 
-import time
-from collections.abc import Iterator
-from contextlib import contextmanager
 from dataclasses import replace
 
 import numpy as np
@@ -67,18 +64,18 @@ class Slam:
         """One frame, from its curvature and flow to an adjusted map."""
         self.take_adjustment()
         self._condense_when_due()
-        with self._timed("track_extrema"):
+        with self.times.timed("track_extrema"):
             self.tracks = self._track(front)
         if self.state is SlamState.INITIALIZING:
             self._refill_when_due(front)
-            with self._timed("initialize"):
+            with self.times.timed("initialize"):
                 self._initialize(front)
         else:
-            with self._timed("localize"):
+            with self.times.timed("localize"):
                 T_cam_world = self._localize(front)
             self._refill_when_due(front)
             if T_cam_world is not None:
-                with self._timed("map"):
+                with self.times.timed("map"):
                     self._map(front, T_cam_world)
         self._frame_count += 1
         self._newest_frame = front.frame.index
@@ -97,7 +94,7 @@ class Slam:
     def _refill_when_due(self, front: FrontEndFrame) -> None:
         """Every few frames, free extrema become tracks."""
         if self._frame_count % self.config.extrema.refill_interval == 0:
-            with self._timed("refill"):
+            with self.times.timed("refill"):
                 self._refill(front)
 
     def _refill(self, front: FrontEndFrame) -> None:
@@ -272,7 +269,7 @@ class Slam:
 
     def _solved(self, window: Window, problem: BundleProblem) -> WindowAdjustment:
         """Runs on the adjuster's thread."""
-        with self._timed("bundle_adjustment_keyframe"):
+        with self.times.timed("bundle_adjustment_keyframe"):
             return WindowAdjustment(window, adjust_bundle(problem, self.camera, self.config.bundle_adjustment)[0])
 
     def take_adjustment(self, wait: bool = False) -> None:
@@ -287,7 +284,7 @@ class Slam:
         new_ids = self._next_id - self._num_condensed
         if self.state is SlamState.INITIALIZING or not is_due(self.map, new_ids, self.config.memory):
             return
-        with self._timed("condense"):
+        with self.times.timed("condense"):
             self.take_adjustment(wait=True)
             needed = np.concatenate([self.tracks.ids, *(pair.ravel() for pair in self._meetings)])
             done = condense(self.map, np.unique(needed), UNTAKEN_WINDOWS * self.config.window.keyframes, self.config.memory)
@@ -313,7 +310,7 @@ class Slam:
 
     def _refine_calibration(self) -> None:
         """The camera's parameters from all of the map (or as they were); the map moves along."""
-        with self._timed("self_calibration"):
+        with self.times.timed("self_calibration"):
             self.camera = self.calibration.refine(self.map, self.camera)
 
     def _remove_outliers(self, window: Window, solved: BundleProblem, limit_px: float) -> None:
@@ -328,7 +325,7 @@ class Slam:
         adjustment = self.config.bundle_adjustment
         if adjustment.sweeps_per_frame == 0:
             return T_cam_world
-        with self._timed("bundle_adjustment_frame"):
+        with self.times.timed("bundle_adjustment_frame"):
             seen, pixels = self._seen()
             mapped = self.map.is_mapped(seen.ids)
             window = select_frame_window(self.map, adjustment.frame_keyframes, self.config.window.keyframes)
@@ -345,7 +342,7 @@ class Slam:
         if self.calibration.is_enabled:
             self._refine_calibration()
         everything = whole_map(self.map)
-        with self._timed("final_adjustment"):
+        with self.times.timed("final_adjustment"):
             for sigma, outlier in ((window_round.sigma_px, window_round.outlier_px), (final.sigma_px, final.outlier_px)):
                 problem = build_problem(self.map, everything)
                 solved, _ = adjust_accelerated(problem, self.camera, sigma, final.iterations, final.relative_gain)
@@ -374,9 +371,3 @@ class Slam:
     def keyframe_trajectory(self) -> Trajectory:
         """Camera-to-world poses of the keyframes."""
         return Trajectory(np.array(self.map.timestamps_ns, np.int64), inverse(self.map.T_cam_world))
-
-    @contextmanager
-    def _timed(self, step: str) -> Iterator[None]:
-        start = time.perf_counter()
-        yield
-        self.times.add(step, time.perf_counter() - start)

@@ -11,6 +11,10 @@ Conventions, here once for the whole project:
 * Time is an integer number of nanoseconds, so that time stamps come out exactly as they went in.
 """
 
+import time
+from array import array
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from dataclasses import dataclass, field
 from enum import Enum
 from typing import Any
@@ -251,7 +255,16 @@ class SlamState(Enum):
 class StepTimes:
     """Milliseconds of each step, by name; grows while a run lasts."""
 
-    milliseconds: dict[str, list[float]] = field(default_factory=dict)
+    milliseconds: dict[str, "array[float]"] = field(default_factory=dict)
+    clock: Callable[[], float] = time.perf_counter
+    """Seconds; `time.thread_time` measures the thread's own CPU."""
 
     def add(self, step: str, seconds: float) -> None:
-        self.milliseconds.setdefault(step, []).append(1e3 * seconds)
+        self.milliseconds.setdefault(step, array("d")).append(1e3 * seconds)
+
+    @contextmanager
+    def timed(self, step: str) -> Iterator[None]:
+        """Adds the time of what is inside."""
+        start = self.clock()
+        yield
+        self.add(step, self.clock() - start)

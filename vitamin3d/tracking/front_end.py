@@ -1,8 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """The part of the front end that needs pixels only, so that a thread can run it ahead of the map."""
 
-import time
-
 import cv2
 import numpy as np
 
@@ -32,15 +30,13 @@ class FrontEnd:
 
     def process(self, frame: Frame) -> FrontEndFrame:
         """Curvature (Eq. 1), its maxima (Sec. 2.1) and the flow since the previous frame (Sec. 2.2)."""
-        start = time.perf_counter()
-        kappa = curvature(frame.image, self.config.curvature)
-        extrema = detect_extrema(kappa, self.config.extrema)
-        after_extrema = time.perf_counter()
-        flow = self._dense_flow(frame.image)
-        if self.config.extrema_tracking.prediction == "dominant_flow":
-            self._update_dominant_flow(frame.image)
-        self.times.add("curvature_extrema", after_extrema - start)
-        self.times.add("flow", time.perf_counter() - after_extrema)
+        with self.times.timed("curvature_extrema"):
+            kappa = curvature(frame.image, self.config.curvature)
+            extrema = detect_extrema(kappa, self.config.extrema)
+        with self.times.timed("flow"):
+            flow = self._dense_flow(frame.image)
+            if self.config.extrema_tracking.prediction == "dominant_flow":
+                self._update_dominant_flow(frame.image)
         return FrontEndFrame(frame, kappa, extrema, self._dominant_flow, flow)
 
     def _dense_flow(self, image: Array) -> Array | None:
