@@ -26,7 +26,7 @@ from vitamin3d.bundle_adjustment.adjust import SOLVERS, AdjustmentSettings, adju
 from vitamin3d.bundle_adjustment.problem import BundleProblem, make_problem
 from vitamin3d.bundle_adjustment.rejection import reject
 from vitamin3d.bundle_adjustment.self_calibration import adjust_with_intrinsics
-from vitamin3d.bundle_adjustment.subspace import by_camera_of, new_scratch, sweep_cameras, sweep_points
+from vitamin3d.bundle_adjustment.subspace import new_scratch, sweep_cameras, sweep_points
 from vitamin3d.bundle_adjustment.variables import Variables, free_slots, pinhole_model, sightings_of
 from vitamin3d.config import Config
 from vitamin3d.datasets import Unreadable, open_dataset
@@ -218,9 +218,9 @@ def sweep_throughput(path: Path) -> None:
     problem, camera = load_problem(path)
     problem = dataclasses.replace(problem, camera_is_free=np.ones(len(problem.T_cam_world), np.bool_))
     variables, scratch = Variables.of(problem, pinhole_model(camera)), new_scratch()
-    views, sightings, by_camera = variables.views(free_slots(problem)), sightings_of(problem), by_camera_of(problem)
-    cameras, _ = least_seconds(lambda: sweep_cameras(views, by_camera, variables.points, 0.25, scratch), 20)
-    points, _ = least_seconds(lambda: sweep_points(views, sightings, variables.points, 0.25, scratch), 20)
+    views, sightings = variables.views(free_slots(problem)), sightings_of(problem)
+    cameras, _ = least_seconds(lambda: sweep_cameras(views, sightings, variables.points, 0.25, scratch), 20)
+    points, _ = least_seconds(lambda: sweep_points(views, sightings, variables.points, 0.25), 20)
     count = len(problem.obs_pixels)
     print(f"{path.name}: {1e9 * cameras / count:.1f} + {1e9 * points / count:.1f} ns, {1e-6 * count / (cameras + points):.1f} million/s")
 

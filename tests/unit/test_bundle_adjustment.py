@@ -10,8 +10,9 @@ from scipy.sparse import lil_matrix
 from scipy.spatial.transform import Rotation
 
 from vitamin3d.bundle_adjustment.adjust import SOLVERS, adjust_bundle
+from vitamin3d.bundle_adjustment.observations import total_cost
 from vitamin3d.bundle_adjustment.schur import ReducedSystem, adjust_schur
-from vitamin3d.bundle_adjustment.subspace import adjust_subspace, by_camera_of, new_scratch, sweep_cameras, sweep_points, total_cost
+from vitamin3d.bundle_adjustment.subspace import adjust_subspace, new_scratch, sweep_cameras, sweep_points
 from vitamin3d.bundle_adjustment.variables import (
     Variables,
     free_slots,
@@ -243,11 +244,11 @@ def test_a_sweep_allocates_nothing(start):
     runtime = pytest.importorskip("numba.core.runtime")
     runtime._nrt_python.memsys_enable_stats()
     variables, scratch = Variables.of(start, pinhole_model(PINHOLE)), new_scratch()
-    views, sightings, by_camera = variables.views(free_slots(start)), sightings_of(start), by_camera_of(start)
+    views, sightings = variables.views(free_slots(start)), sightings_of(start)
     before = runtime.rtsys.get_allocation_stats().alloc
-    sweep_cameras(views, by_camera, variables.points, 0.25, scratch)
-    sweep_points(views, sightings, variables.points, 0.25, scratch)
-    handed_over = len(views) + len(by_camera) + 1 + len(scratch) + len(views) + len(sightings) + 1 + len(scratch)
+    sweep_cameras(views, sightings, variables.points, 0.25, scratch)
+    sweep_points(views, sightings, variables.points, 0.25)
+    handed_over = 2 * (len(views) + len(sightings) + 1) + len(scratch)
     assert runtime.rtsys.get_allocation_stats().alloc - before in (0, handed_over)
 
 

@@ -3,8 +3,8 @@
 
 Variables: the poses of F free cameras, six each; K parameters of the camera model, either shared by all cameras (then
 they are a border around the pose blocks) or each camera's own (then its block is 6 + K wide). The reduced system is
-S = H_cc - H_cp H_pp⁻¹ H_cpᵀ. One pass over the observations, sorted by point, linearises them, eliminates the
-point while its blocks are at hand, and subtracts its part from the upper triangle of S.
+S = H_cc - H_cp H_pp⁻¹ H_cpᵀ. One pass by camera fills H_cc, eight observations at a time; one by point, eight points at a
+time, linearises, eliminates the points while their blocks are at hand, and subtracts their parts from the upper triangle of S.
 """
 
 from typing import NamedTuple
@@ -12,33 +12,33 @@ from typing import NamedTuple
 import numpy as np
 
 from vitamin3d._jit import inlined, kernel
-from vitamin3d.geometry.reprojection import in_camera, linearize_normalized, model_derivatives, retract, squared_error_normalized
-from vitamin3d.geometry.robust import geman_mcclure
+from vitamin3d._lanes import WIDTH, gather, lanes, load, scatter, select, square_root, store, total, transposed
+from vitamin3d.bundle_adjustment.observations import (
+    Sightings,
+    Views,
+    information,
+    linearize_rows,
+    linearize_sighting,
+    models_are_distorted,
+    point_group,
+    robust_cost,
+    squared_error_sighting,
+)
+from vitamin3d.geometry.reprojection import model_derivatives, model_of, models_of, points_of, pose_of, retract
 from vitamin3d.types import Array
 
 
-class Views(NamedTuple):
-    """The cameras, for the kernels."""
-
-    R: Array
-    """(C, 3, 3)."""
-    t: Array
-    """(C, 3)."""
-    slot: Array
-    """(C,) int64: number among the free cameras, ascending, -1 where the camera is fixed."""
-    models: Array
-    """(C, 8) fx fy cx cy k1 k2 p1 p2 of each camera, or (1, 8) of all."""
+def _padded(width: int) -> int:
+    """The columns of a block of so many columns where it is read and written by lanes."""
+    return -(-width // WIDTH) * WIDTH
 
 
-class Sightings(NamedTuple):
-    """The observations sorted by point, for the kernels."""
-
-    starts: Array
-    """(P + 1,) int64."""
-    camera: Array
-    """(M,) int32, ascending within a point."""
-    pixels: Array
-    """(M, 2)."""
+def aligned_zeros(rows: int, columns: int) -> Array:
+    """(rows, columns) such that lanes of eight columns lie in one line of the processor's cache each."""
+    size = rows * columns
+    flat = np.zeros(size + WIDTH)
+    first = -(flat.ctypes.data // flat.itemsize) % WIDTH
+    return flat[first : first + size].reshape(rows, columns)
 
 
 class NormalEquations(NamedTuple):
@@ -60,346 +60,448 @@ class NormalEquations(NamedTuple):
     """(P, 3)."""
     root: Array
     """(P, 6): H_pp⁻¹ = L Lᵀ, L upper triangular (00 01 02 11 12 22); zeros where the point cannot move."""
+    sums: Array
+    """(N + 1, ..): where `reduced` and, in the last row, -`lifted` are summed: each block has eight columns, or sixteen if it needs
+    them, so that it is read and written as a whole."""
 
     @staticmethod
     def zeros(num_free: int, width: int, num_shared: int, num_points: int) -> "NormalEquations":
         F, D, K = num_free, width, num_shared
         N = F * D + K
         shapes = ((N, N), (N,), (N,), (F, D, D), (F, 6, K), (K, K), (num_points, 3), (num_points, 6))
-        return NormalEquations(*(np.zeros(shape) for shape in shapes))
+        return NormalEquations(*(np.zeros(shape) for shape in shapes), aligned_zeros(N + 1, F * _padded(D) + _padded(K)))
 
     def clear(self) -> None:
-        """Zeros again, all but what is overwritten."""
-        for array in self[:6]:
+        """Zeros again, all but what is overwritten or cleared when it is read."""
+        for array in (self.gradient, self.H_cameras, self.H_border, self.H_shared):
             array.fill(0.0)
 
-
-class _Scratch(NamedTuple):
-    """What one point needs, for the longest track."""
-
-    terms: Array
-    """(n, 9): q a b, the two rows of G Jp (3 each)."""
-    J: Array
-    """(2, 8) by the camera model."""
-    Jk: Array
-    """(2, K) by its free parameters."""
-    V: Array
-    """(3, D n + K) columns of H_cp L."""
-    column: Array
-    """(n + 1,) column of S where each block of V goes."""
-    end: Array
-    """(n + 1,) after how many blocks the neighbours' columns cease to be neighbours."""
-    W: Array
-    """(n, 3, K): Jpᵀ G Jk of each observation, where cameras have parameters of their own; else the sum is the first."""
-
-
-@kernel
-def _longest(starts):  # type: ignore[no-untyped-def]
-    longest = 0
-    for p in range(starts.shape[0] - 1):
-        longest = max(longest, starts[p + 1] - starts[p])
-    return longest
-
-
-def _scratch(starts: Array, width: int, K: int) -> _Scratch:
-    n = int(_longest(starts))
-    V, W = np.empty((3, width * n + K)), np.empty((n if width > 6 else 1, 3, K))
-    integers = np.empty((2, n + 1), np.int64)
-    return _Scratch(np.empty((n, 9)), np.empty((2, 8)), np.empty((2, K)), V, integers[0], integers[1], W)
+# --- blocks ------------------------------------------------------------------------------------------------------
 
 
 @inlined
-def inverse_root(H0, H1, H2, H3, H4, H5):  # type: ignore[no-untyped-def]
-    """L upper triangular with H⁻¹ = L Lᵀ, by the Cholesky factor of H; both as 00 01 02 11 12 22. Zeros where H is singular."""
-    c00 = np.sqrt(max(H0, 0.0))
-    c10, c20 = H1 / c00, H2 / c00
-    d11 = H3 - c10 * c10
-    c11 = np.sqrt(max(d11, 0.0))
-    c21 = (H4 - c20 * c10) / c11
-    d22 = H5 - c20 * c20 - c21 * c21
-    if not (H0 > 0.0 and d11 > 1e-14 * H3 and d22 > 1e-14 * H5):
-        return 0.0, 0.0, 0.0, 0.0, 0.0, 0.0
-    c22 = np.sqrt(d22)
-    return (
-        1.0 / c00, -c10 / (c00 * c11), (c10 * c21 - c20 * c11) / (c00 * c11 * c22), 1.0 / c11, -c21 / (c11 * c22), 1.0 / c22,
-    )  # fmt: skip
+def no_camera():  # type: ignore[no-untyped-def]
+    """The empty sum of `add_camera`."""
+    z = lanes(0.0)
+    return (z, z, z, z, z, z, z, z, z, z, z, z, z, z, z, z, z, z, z, z, z, z, z, z, z, z, z)
 
 
 @inlined
-def linearize_observation(R, t, c, models, m, is_distorted, points, n, pixels, i):  # type: ignore[no-untyped-def]
-    """`linearize_normalized` of observation i: point n from camera c of model m."""
-    x, y, z = in_camera(R, t, c, points, n)
-    return linearize_normalized(
-        x, y, z, is_distorted, models[m, 0], models[m, 1], models[m, 2], models[m, 3], models[m, 4], models[m, 5], models[m, 6],
-        models[m, 7], pixels[i, 0], pixels[i, 1],
-    )  # fmt: skip
+def add_camera(s, q, a, b, g00, g01, g11, h0, h1):  # type: ignore[no-untyped-def]
+    """Adds observations to Jᵀ h (6) and Jᵀ G J (21, upper triangle by rows) of a camera, eight sums each.
 
-
-@inlined
-def observation_error(R, t, c, models, m, is_distorted, points, n, pixels, i):  # type: ignore[no-untyped-def]
-    """`squared_error_normalized` of observation i: point n from camera c of model m."""
-    x, y, z = in_camera(R, t, c, points, n)
-    return squared_error_normalized(
-        x, y, z, is_distorted, models[m, 0], models[m, 1], models[m, 2], models[m, 3], models[m, 4], models[m, 5], models[m, 6],
-        models[m, 7], pixels[i, 0], pixels[i, 1],
-    )  # fmt: skip
-
-
-@inlined
-def information(r0, r1, p00, p01, p10, p11, inverse_squared_sigma, most_bend):  # type: ignore[no-untyped-def]
-    """Robust cost, G = pᵀ W p (00 01 11), h = pᵀ w r, and W (00 01 11): what derivatives by (a, b) are summed with.
-
-    W is the weight w, less along the residual by the kernel's bending (rho'' < rho' / r): that makes steps longer, by
-    1 / (1 - most_bend) at most; with 0 it is iteratively reweighted least squares.
-    """
-    e = r0 * r0 + r1 * r1
-    cost, w = geman_mcclure(e, inverse_squared_sigma)
-    w00, w01, w11 = w, 0.0, w
-    if most_bend > 0.0 and e > 0.0:
-        bend = w * min(4.0 * inverse_squared_sigma * np.sqrt(w), most_bend / e)
-        w00, w01, w11 = w - bend * r0 * r0, -bend * r0 * r1, w - bend * r1 * r1
-    x0, x1 = w00 * p00 + w01 * p10, w01 * p00 + w11 * p10
-    y0, y1 = w00 * p01 + w01 * p11, w01 * p01 + w11 * p11
-    g00, g01, g11 = p00 * x0 + p10 * x1, p00 * y0 + p10 * y1, p01 * y0 + p11 * y1
-    return cost, g00, g01, g11, w * (p00 * r0 + p10 * r1), w * (p01 * r0 + p11 * r1), w00, w01, w11
-
-
-@inlined
-def add_camera(H, f, g, at, q, a, b, g00, g01, g11, h0, h1):  # type: ignore[no-untyped-def]
-    """Adds an observation to block f of H (F, 6.., 6..) and the gradient g from `at`: Jᵀ G J and Jᵀ h, upper triangle.
-
-    J is that of `linearize_normalized` without p; m = G (a, b), n = G (-b, a), written out: there is no time for loops.
+    J is that of `linearize_lanes` without p; m = G (a, b), n = G (-b, a), written out: there is no time for loops.
     """
     hz = a * h0 + b * h1
-    g[at] += q * h0
-    g[at + 1] += q * h1
-    g[at + 2] -= q * hz
-    g[at + 3] -= b * hz + h1
-    g[at + 4] += h0 + a * hz
-    g[at + 5] += a * h1 - b * h0
     m0, m1, n0, n1 = g00 * a + g01 * b, g01 * a + g11 * b, g01 * a - g00 * b, g11 * a - g01 * b
     k, nz = a * m0 + b * m1, a * n0 + b * n1
     q0, q1, q2, qm0, qm1, qk = q * g00, q * g01, q * g11, q * m0, q * m1, q * k
-    H[f, 0, 0] += q * q0
-    H[f, 0, 1] += q * q1
-    H[f, 0, 2] += -q * qm0
-    H[f, 0, 3] += -b * qm0 - q1
-    H[f, 0, 4] += a * qm0 + q0
-    H[f, 0, 5] += q * n0
-    H[f, 1, 1] += q * q2
-    H[f, 1, 2] += -q * qm1
-    H[f, 1, 3] += -b * qm1 - q2
-    H[f, 1, 4] += a * qm1 + q1
-    H[f, 1, 5] += q * n1
-    H[f, 2, 2] += q * qk
-    H[f, 2, 3] += b * qk + qm1
-    H[f, 2, 4] += -a * qk - qm0
-    H[f, 2, 5] += -q * nz
-    H[f, 3, 3] += b * (b * k + 2.0 * m1) + g11
-    H[f, 3, 4] += -b * (a * k + m0) - a * m1 - g01
-    H[f, 3, 5] += -b * nz - n1
-    H[f, 4, 4] += a * (a * k + 2.0 * m0) + g00
-    H[f, 4, 5] += a * nz + n0
-    H[f, 5, 5] += a * n1 - b * n0
+    return (
+        s[0] + q * h0, s[1] + q * h1, s[2] - q * hz, s[3] - (b * hz + h1), s[4] + (h0 + a * hz), s[5] + (a * h1 - b * h0),
+        s[6] + q * q0, s[7] + q * q1, s[8] - q * qm0, s[9] - (b * qm0 + q1), s[10] + (a * qm0 + q0), s[11] + q * n0,
+        s[12] + q * q2, s[13] - q * qm1, s[14] - (b * qm1 + q2), s[15] + (a * qm1 + q1), s[16] + q * n1,
+        s[17] + q * qk, s[18] + (b * qk + qm1), s[19] - (a * qk + qm0), s[20] - q * nz,
+        s[21] + (b * (b * k + 2.0 * m1) + g11), s[22] - (b * (a * k + m0) + a * m1 + g01), s[23] - (b * nz + n1),
+        s[24] + (a * (a * k + 2.0 * m0) + g00), s[25] + (a * nz + n0), s[26] + (a * n1 - b * n0),
+    )  # fmt: skip
 
 
 @inlined
-def _add_model(Jk, q, a, b, p00, p01, p10, p11, r0, r1, w, w00, w01, w11, H_pose, H_model, g):  # type: ignore[no-untyped-def]
-    """Adds an observation to the blocks of the camera model: with the pose (6, K), itself (K, K), and its gradient g (K,).
+def write_camera(s, sums, H, g):  # type: ignore[no-untyped-def]
+    """Writes the sums of `add_camera` to H (6.., 6..), upper triangle, and g (6..); `sums` (27,) is memory for it."""
+    for k, part in enumerate(s):
+        sums[k] = total(part)
+    n = 6
+    for i in range(6):
+        g[i] = sums[i]
+        for j in range(i, 6):
+            H[i, j] = sums[n]
+            n += 1
+
+
+@inlined
+def no_point():  # type: ignore[no-untyped-def]
+    """The empty sum of `add_point`."""
+    z = lanes(0.0)
+    return (z, z, z, z, z, z, z, z, z)
+
+
+@inlined
+def by_point(pose, q, a, b):  # type: ignore[no-untyped-def]
+    """The derivative of (a, b) by the point, two rows of three."""
+    return (
+        q * (pose[0] - a * pose[6]), q * (pose[1] - a * pose[7]), q * (pose[2] - a * pose[8]),
+        q * (pose[3] - b * pose[6]), q * (pose[4] - b * pose[7]), q * (pose[5] - b * pose[8]),
+    )  # fmt: skip
+
+
+@inlined
+def weighted(J, g00, g01, g11):  # type: ignore[no-untyped-def]
+    """G J of the two rows of three J."""
+    return (
+        g00 * J[0] + g01 * J[3], g00 * J[1] + g01 * J[4], g00 * J[2] + g01 * J[5],
+        g01 * J[0] + g11 * J[3], g01 * J[1] + g11 * J[4], g01 * J[2] + g11 * J[5],
+    )  # fmt: skip
+
+
+@inlined
+def add_point(s, J, x, h0, h1):  # type: ignore[no-untyped-def]
+    """Adds an observation of each of eight points to Jᵀ G J (00 01 02 11 12 22) and Jᵀ h (3), given x = G J."""
+    return (
+        s[0] + (J[0] * x[0] + J[3] * x[3]), s[1] + (J[0] * x[1] + J[3] * x[4]), s[2] + (J[0] * x[2] + J[3] * x[5]),
+        s[3] + (J[1] * x[1] + J[4] * x[4]), s[4] + (J[1] * x[2] + J[4] * x[5]), s[5] + (J[2] * x[2] + J[5] * x[5]),
+        s[6] + (h0 * J[0] + h1 * J[3]), s[7] + (h0 * J[1] + h1 * J[4]), s[8] + (h0 * J[2] + h1 * J[5]),
+    )  # fmt: skip
+
+
+@inlined
+def inverse_root(H, damping, count):  # type: ignore[no-untyped-def]
+    """L upper triangular with H⁻¹ = L Lᵀ, by the Cholesky factor of H, its diagonal damped; both as 00 01 02 11 12 22.
+
+    Zeros where H is singular, and where a point has fewer than two observations; and which of the eight are none of these.
+    """
+    more = 1.0 + damping
+    H0, H3, H5 = more * H[0], more * H[3], more * H[5]
+    i0 = 1.0 / square_root(H0)
+    c10, c20 = H[1] * i0, H[2] * i0
+    d11 = H3 - c10 * c10
+    i1 = 1.0 / square_root(d11)
+    c21 = (H[4] - c20 * c10) * i1
+    d22 = H5 - c20 * c20 - c21 * c21
+    i2 = 1.0 / square_root(d22)
+    is_regular = (H0 > 0.0) & (d11 > 1e-14 * H3) & (d22 > 1e-14 * H5) & (count > 1)
+    i01 = i0 * i1
+    return is_regular, (
+        select(is_regular, i0, 0.0), select(is_regular, -(c10 * i01), 0.0), select(is_regular, (c10 * c21 * i1 - c20) * i0 * i2, 0.0),
+        select(is_regular, i1, 0.0), select(is_regular, -(c21 * i1 * i2), 0.0), select(is_regular, i2, 0.0),
+    )  # fmt: skip
+
+
+@inlined
+def lifted_gradient(L, g0, g1, g2):  # type: ignore[no-untyped-def]
+    """Lᵀ g."""
+    return L[0] * g0, L[1] * g0 + L[3] * g1, L[2] * g0 + L[4] * g1 + L[5] * g2
+
+
+@inlined
+def point_step(L, g0, g1, g2):  # type: ignore[no-untyped-def]
+    """H⁻¹ g = L Lᵀ g."""
+    x, y, z = lifted_gradient(L, g0, g1, g2)
+    return L[0] * x + L[1] * y + L[2] * z, L[3] * y + L[4] * z, L[5] * z
+
+
+# --- the camera model's parameters -------------------------------------------------------------------------------
+
+
+@inlined
+def by_parameters(a, b, model, basis, Jk):  # type: ignore[no-untyped-def]
+    """Writes to Jk (2, K, 8) the derivatives of the pixel by the K free parameters, eight observations at a time."""
+    d = model_derivatives(a, b, model)
+    K = basis.shape[1]
+    for k in range(K):
+        u = d[0] * basis[0, k] + d[1] * basis[4, k] + d[2] * basis[5, k] + d[3] * basis[6, k] + d[4] * basis[7, k]
+        v = d[5] * basis[1, k] + d[6] * basis[4, k] + d[7] * basis[5, k] + d[8] * basis[6, k] + d[9] * basis[7, k]
+        store(Jk, WIDTH * k, u + basis[2, k])
+        store(Jk, WIDTH * (K + k), v + basis[3, k])
+
+
+@inlined
+def _add(sums, at, x):  # type: ignore[no-untyped-def]
+    store(sums, WIDTH * at, load(sums, WIDTH * at) + x)
+
+
+@inlined
+def _add_model(Jk, K, q, a, b, p00, p01, p10, p11, r0, r1, w, w00, w01, w11, sums):  # type: ignore[no-untyped-def]
+    """Adds observations to `sums` (7 + K, K, 8): the blocks with the pose (6, K), the gradient (K,) and the block itself (K, K).
 
     w, the gradient's weight, is that without the kernel's bending.
     """
-    for k in range(Jk.shape[1]):
-        x, y = w00 * Jk[0, k] + w01 * Jk[1, k], w01 * Jk[0, k] + w11 * Jk[1, k]
-        g[k] += w * (Jk[0, k] * r0 + Jk[1, k] * r1)
-        for n in range(k, Jk.shape[1]):
-            H_model[k, n] += x * Jk[0, n] + y * Jk[1, n]
-        if H_pose.shape[0] == 6:
-            u, v = p00 * x + p10 * y, p01 * x + p11 * y
-            z = a * u + b * v
-            H_pose[0, k] += q * u
-            H_pose[1, k] += q * v
-            H_pose[2, k] -= q * z
-            H_pose[3, k] -= b * z + v
-            H_pose[4, k] += u + a * z
-            H_pose[5, k] += a * v - b * u
+    for k in range(K):
+        j0, j1 = load(Jk, WIDTH * k), load(Jk, WIDTH * (K + k))
+        x, y = w00 * j0 + w01 * j1, w01 * j0 + w11 * j1
+        u, v = p00 * x + p10 * y, p01 * x + p11 * y
+        z = a * u + b * v
+        _add(sums, k, q * u)
+        _add(sums, K + k, q * v)
+        _add(sums, 2 * K + k, -(q * z))
+        _add(sums, 3 * K + k, -(b * z + v))
+        _add(sums, 4 * K + k, u + a * z)
+        _add(sums, 5 * K + k, a * v - b * u)
+        _add(sums, 6 * K + k, w * (j0 * r0 + j1 * r1))
+        for n in range(k, K):
+            _add(sums, 7 * K + K * k + n, x * load(Jk, WIDTH * n) + y * load(Jk, WIDTH * (K + n)))
 
 
 @inlined
-def _columns(terms, i, L0, L1, L2, L3, L4, L5, V, at):  # type: ignore[no-untyped-def]
-    """Columns at.. of V (3, N): the six rows of H_cp L of observation i of `terms`."""
-    q, a, b = terms[i, 0], terms[i, 1], terms[i, 2]
-    x0, x1, x2 = terms[i, 3] * L0, terms[i, 3] * L1 + terms[i, 4] * L3, terms[i, 3] * L2 + terms[i, 4] * L4 + terms[i, 5] * L5
-    y0, y1, y2 = terms[i, 6] * L0, terms[i, 6] * L1 + terms[i, 7] * L3, terms[i, 6] * L2 + terms[i, 7] * L4 + terms[i, 8] * L5
-    z0, z1, z2 = a * x0 + b * y0, a * x1 + b * y1, a * x2 + b * y2
-    V[0, at], V[1, at], V[2, at] = q * x0, q * x1, q * x2
-    V[0, at + 1], V[1, at + 1], V[2, at + 1] = q * y0, q * y1, q * y2
-    V[0, at + 2], V[1, at + 2], V[2, at + 2] = -q * z0, -q * z1, -q * z2
-    V[0, at + 3], V[1, at + 3], V[2, at + 3] = -b * z0 - y0, -b * z1 - y1, -b * z2 - y2
-    V[0, at + 4], V[1, at + 4], V[2, at + 4] = x0 + a * z0, x1 + a * z1, x2 + a * z2
-    V[0, at + 5], V[1, at + 5], V[2, at + 5] = a * y0 - b * x0, a * y1 - b * x1, a * y2 - b * x2
+def _write_model(sums, K, H_pose, H_model, g):  # type: ignore[no-untyped-def]
+    """Adds the sums of `_add_model` to their blocks; H_pose may have no rows."""
+    for k in range(K):
+        for m in range(H_pose.shape[0]):
+            H_pose[m, k] += total(load(sums, WIDTH * (K * m + k)))
+        g[k] += total(load(sums, WIDTH * (6 * K + k)))
+        for n in range(k, K):
+            H_model[k, n] += total(load(sums, WIDTH * (7 * K + K * k + n)))
 
 
-@inlined
-def _model_columns(W, i, L0, L1, L2, L3, L4, L5, V, at):  # type: ignore[no-untyped-def]
-    """Columns at.. of V: the rows of (Jkᵀ G Jp) L of W[i] (3, K)."""
-    for k in range(W.shape[2]):
-        V[0, at + k] = W[i, 0, k] * L0
-        V[1, at + k] = W[i, 0, k] * L1 + W[i, 1, k] * L3
-        V[2, at + k] = W[i, 0, k] * L2 + W[i, 1, k] * L4 + W[i, 2, k] * L5
+# --- one pass by camera ------------------------------------------------------------------------------------------
 
 
-@inlined
-def _subtract_products(V, blocks, width, num_columns, column, end, S):  # type: ignore[no-untyped-def]
-    """S -= Vᵀ V: block i of V, columns width i.., goes to column[i].. of S; upper triangle of blocks. end[i]: see `_Scratch`.
+class _CameraScratch(NamedTuple):
+    """What a camera needs."""
 
-    Neighbouring cameras have neighbouring columns, so that the inner loop runs over a track; three rows share its loads.
-    """
-    for i in range(blocks):
-        first = width * i
-        rows = min(width, num_columns - first)
-        for m in range(0, rows - rows % 3, 3):
-            at = first + m
-            u0, v0, w0 = V[0, at], V[1, at], V[2, at]
-            u1, v1, w1 = V[0, at + 1], V[1, at + 1], V[2, at + 1]
-            u2, v2, w2 = V[0, at + 2], V[1, at + 2], V[2, at + 2]
-            row0, row1, row2 = S[column[i] + m], S[column[i] + m + 1], S[column[i] + m + 2]
-            j = i
-            while j < blocks:
-                start, stop, to = width * j, min(width * end[j], num_columns), column[j]
-                A, B, C = V[0, start:stop], V[1, start:stop], V[2, start:stop]
-                size = stop - start
-                D0, D1, D2 = row0[to : to + size], row1[to : to + size], row2[to : to + size]
-                for n in range(size):
-                    x, y, z = A[n], B[n], C[n]
-                    D0[n] -= u0 * x + v0 * y + w0 * z
-                    D1[n] -= u1 * x + v1 * y + w1 * z
-                    D2[n] -= u2 * x + v2 * y + w2 * z
-                j = end[j]
-        for m in range(rows - rows % 3, rows):
-            u0, v0, w0, row0 = V[0, first + m], V[1, first + m], V[2, first + m], S[column[i] + m]
-            j = i
-            while j < blocks:
-                start, stop = width * j, min(width * end[j], num_columns)
-                for n in range(start, stop):
-                    row0[column[j] + n - start] -= u0 * V[0, n] + v0 * V[1, n] + w0 * V[2, n]
-                j = end[j]
-
-
-@inlined
-def models_are_distorted(models):  # type: ignore[no-untyped-def]
-    """Whether any k1 k2 p1 p2 counts."""
-    for m in range(models.shape[0]):
-        for k in range(4, 8):
-            if models[m, k] != 0.0:
-                return True
-    return False
-
-
-@inlined
-def _times_basis(J, basis, Jk):  # type: ignore[no-untyped-def]
-    for m in range(2):
-        for k in range(basis.shape[1]):
-            total = 0.0
-            for n in range(8):
-                total += J[m, n] * basis[n, k]
-            Jk[m, k] = total
+    sums: Array
+    """(27,)."""
+    Jk: Array
+    """(2, K, 8)."""
+    of_model: Array
+    """(7 + K, K, 8)."""
 
 
 @kernel
-def _accumulate(views, sightings, points, basis, inverse_squared_sigma, most_bend, damping, equations, scratch):  # type: ignore[no-untyped-def]
-    S, gradient, lifted, H_cameras, H_border, H_shared, point_gradient, root = equations
-    terms, J, Jk, V, column, end, W = scratch
+def _accumulate_cameras(views, sightings, points, basis, inverse_squared_sigma, most_bend, equations, scratch):  # type: ignore[no-untyped-def]
     R, t, slot, models = views
-    starts, cameras, pixels = sightings
-    K, D, F = basis.shape[1], H_cameras.shape[1], H_cameras.shape[0]
-    is_own, distorted, many = D > 6, models_are_distorted(models), models.shape[0] > 1
-    nothing = np.empty((0, K))
-    cost = 0.0
-    for p in range(points.shape[0]):
-        first, last = starts[p], starts[p + 1]
-        H0, H1, H2, H3, H4, H5, g0, g1, g2 = 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0
-        W[0, :, :] = 0.0
-        num = 0
-        for i in range(first, last):
-            c = cameras[i]
-            m = c if many else 0
-            q, a, b, r0, r1, p00, p01, p10, p11 = linearize_observation(R, t, c, models, m, distorted, points, p, pixels, i)
-            if q == 0.0:
-                cost += 1.0 / inverse_squared_sigma
-                continue
-            rho, g00, g01, g11, h0, h1, w00, w01, w11 = information(r0, r1, p00, p01, p10, p11, inverse_squared_sigma, most_bend)
-            cost += rho
-            s0, s1, s2 = q * (R[c, 0, 0] - a * R[c, 2, 0]), q * (R[c, 0, 1] - a * R[c, 2, 1]), q * (R[c, 0, 2] - a * R[c, 2, 2])
-            t0, t1, t2 = q * (R[c, 1, 0] - b * R[c, 2, 0]), q * (R[c, 1, 1] - b * R[c, 2, 1]), q * (R[c, 1, 2] - b * R[c, 2, 2])
-            x0, x1, x2 = g00 * s0 + g01 * t0, g00 * s1 + g01 * t1, g00 * s2 + g01 * t2
-            y0, y1, y2 = g01 * s0 + g11 * t0, g01 * s1 + g11 * t1, g01 * s2 + g11 * t2
-            H0 += s0 * x0 + t0 * y0
-            H1 += s0 * x1 + t0 * y1
-            H2 += s0 * x2 + t0 * y2
-            H3 += s1 * x1 + t1 * y1
-            H4 += s1 * x2 + t1 * y2
-            H5 += s2 * x2 + t2 * y2
-            g0 += h0 * s0 + h1 * t0
-            g1 += h0 * s1 + h1 * t1
-            g2 += h0 * s2 + h1 * t2
-            f = slot[c]
-            if K > 0 and (f >= 0 or not is_own):
-                w = geman_mcclure(r0 * r0 + r1 * r1, inverse_squared_sigma)[1]
-                model_derivatives(models, m, a, b, J)
-                _times_basis(J, basis, Jk)
-                if is_own:
-                    _add_model(
-                        Jk, q, a, b, p00, p01, p10, p11, r0, r1, w, w00, w01, w11,
-                        H_cameras[f, :6, 6:], H_cameras[f, 6:, 6:], gradient[D * f + 6 : D * f + D],
-                    )  # fmt: skip
-                    W[num, :, :] = 0.0
-                else:
-                    _add_model(
-                        Jk, q, a, b, p00, p01, p10, p11, r0, r1, w, w00, w01, w11,
-                        H_border[f] if f >= 0 else nothing, H_shared, gradient[D * F :],
-                    )  # fmt: skip
-                row = num if is_own else 0
-                for k in range(K):
-                    x, y = w00 * Jk[0, k] + w01 * Jk[1, k], w01 * Jk[0, k] + w11 * Jk[1, k]
-                    u, v = p00 * x + p10 * y, p01 * x + p11 * y
-                    W[row, 0, k] += u * s0 + v * t0
-                    W[row, 1, k] += u * s1 + v * t1
-                    W[row, 2, k] += u * s2 + v * t2
-            if f < 0:
-                continue
-            column[num] = D * f
-            terms[num, 0], terms[num, 1], terms[num, 2] = q, a, b
-            terms[num, 3], terms[num, 4], terms[num, 5] = x0, x1, x2
-            terms[num, 6], terms[num, 7], terms[num, 8] = y0, y1, y2
-            num += 1
-            add_camera(H_cameras, f, gradient, D * f, q, a, b, g00, g01, g11, h0, h1)
-        point_gradient[p, 0], point_gradient[p, 1], point_gradient[p, 2] = g0, g1, g2
-        more = 1.0 + damping
-        L0, L1, L2, L3, L4, L5 = inverse_root(more * H0, H1, H2, more * H3, H4, more * H5)
-        if last - first < 2:
-            L0, L1, L2, L3, L4, L5 = 0.0, 0.0, 0.0, 0.0, 0.0, 0.0
-        root[p, 0], root[p, 1], root[p, 2], root[p, 3], root[p, 4], root[p, 5] = L0, L1, L2, L3, L4, L5
-        if L0 == 0.0:
+    sums, Jk, of_model = scratch
+    K, F, D = basis.shape[1], equations.H_cameras.shape[0], equations.H_cameras.shape[1]
+    is_own, is_distorted, nothing = D > 6, models_are_distorted(models), np.empty((0, K))
+    gradient = equations.gradient
+    for c in range(R.shape[0]):
+        f = slot[c]
+        if f < 0 and (K == 0 or is_own):
             continue
-        z0, z1, z2 = L0 * g0, L1 * g0 + L3 * g1, L2 * g0 + L4 * g1 + L5 * g2
-        for i in range(num):
-            _columns(terms, i, L0, L1, L2, L3, L4, L5, V, D * i)
+        first, last = sightings.camera_starts[c], sightings.camera_starts[c + 1]
+        pose, model = pose_of(R, t, c), model_of(models, c if models.shape[0] > 1 else 0)
+        block = no_camera()
+        of_model[:] = 0.0
+        for i in range(first, last, WIDTH):
+            is_there, seen = linearize_rows(sightings, points, pose, model, is_distorted, i, last)
+            is_seen, q, a, b, r0, r1, p00, p01, p10, p11 = seen
+            _, w, g00, g01, g11, h0, h1, w00, w01, w11 = information(
+                is_there, is_seen, r0, r1, p00, p01, p10, p11, inverse_squared_sigma, most_bend
+            )
+            block = add_camera(block, q, a, b, g00, g01, g11, h0, h1)
+            if K > 0:
+                by_parameters(a, b, model, basis, Jk)
+                _add_model(Jk, K, q, a, b, p00, p01, p10, p11, r0, r1, w, w00, w01, w11, of_model)
+        if f >= 0:
+            write_camera(block, sums, equations.H_cameras[f], gradient[D * f :])
+        if K > 0 and is_own:
+            H = equations.H_cameras[f]
+            _write_model(of_model, K, H[:6, 6:], H[6:, 6:], gradient[D * f + 6 :])
+        elif K > 0:
+            _write_model(of_model, K, equations.H_border[f] if f >= 0 else nothing, equations.H_shared, gradient[D * F :])
+
+
+# --- one pass by point -------------------------------------------------------------------------------------------
+
+
+class _Scratch(NamedTuple):
+    """What eight points need, for the longest track of n observations."""
+
+    terms: Array
+    """(n + 1, 9, 8): q a b, the two rows of G Jp (3 each)."""
+    Jk: Array
+    """(2, K, 8)."""
+    W: Array
+    """(n + 1, 3, K, 8): Jpᵀ G Jk of each observation, where cameras have parameters of their own; else the sum is the first."""
+    z: Array
+    """(3, 8): Lᵀ g."""
+    columns: Array
+    """(8 (n + 1), 3 padded D): of each point and observation the three rows of Lᵀ H_pc, and last those of the shared parameters;
+    zeros behind D."""
+    blocks: Array
+    """(n + 1, 3): of the observations by free cameras which row of `columns`, and first row and column of `sums`."""
+
+
+def _scratch(sightings: Sightings, width: int, K: int) -> _Scratch:
+    starts, by_length = sightings.starts, sightings.by_length
+    n = int(starts[by_length[0] + 1] - starts[by_length[0]]) if len(by_length) else 0
+    W = np.empty((n + 1 if width > 6 else 1, 3, K, WIDTH))
+    columns = aligned_zeros(WIDTH * (n + 1), 3 * max(_padded(width), _padded(K)))
+    terms, Jk, z = (np.empty((*shape, WIDTH)) for shape in ((n + 1, 9), (2, K), (3,)))
+    return _Scratch(terms, Jk, W, z, columns, np.empty((n + 1, 3), np.int64))
+
+
+@inlined
+def _write_rows(x, columns, n, many, at):  # type: ignore[no-untyped-def]
+    """Writes eight columns of eight points, one of x (8,) after another, to columns `at`.. of the points' rows n of `many`."""
+    of_points, stride = transposed(x), columns.shape[1]
+    for k in range(WIDTH):
+        store(columns, stride * (many * k + n) + at, of_points[k])
+
+
+@inlined
+def _pose_columns(terms, n, L, model, columns, many):  # type: ignore[no-untyped-def]
+    """Writes the three rows of Lᵀ H_pc of observation n of eight points: six columns by the pose, two by the camera's `model`."""
+    k, size = 9 * WIDTH * n, columns.shape[1] // 3
+    q, a, b = load(terms, k), load(terms, k + WIDTH), load(terms, k + 2 * WIDTH)
+    x = lifted_gradient(L, load(terms, k + 3 * WIDTH), load(terms, k + 4 * WIDTH), load(terms, k + 5 * WIDTH))
+    y = lifted_gradient(L, load(terms, k + 6 * WIDTH), load(terms, k + 7 * WIDTH), load(terms, k + 8 * WIDTH))
+    for r in range(3):
+        z = a * x[r] + b * y[r]
+        six = q * x[r], q * y[r], -(q * z), -(b * z + y[r]), x[r] + a * z, a * y[r] - b * x[r]
+        _write_rows((*six, model[0][r], model[1][r]), columns, n, many, size * r)
+
+
+@inlined
+def _by_model(W, n, K, k, L):  # type: ignore[no-untyped-def]
+    """Lᵀ times column k of W[n] (3, K, 8): three lanes; zeros where there is no such column."""
+    if k >= K:
+        z = lanes(0.0)
+        return z, z, z
+    at = WIDTH * (3 * K * n + k)
+    return lifted_gradient(L, load(W, at), load(W, at + WIDTH * K), load(W, at + 2 * WIDTH * K))
+
+
+@inlined
+def _model_columns(W, n, K, first, L, columns, row, many):  # type: ignore[no-untyped-def]
+    """Writes columns first.. of Lᵀ W of eight points to their rows `row`, where each begins with `first` - 8 or no others before."""
+    size = columns.shape[1] // 3
+    for k in range(first, K, WIDTH):
+        c0, c1, c2, c3 = _by_model(W, n, K, k, L), _by_model(W, n, K, k + 1, L), _by_model(W, n, K, k + 2, L), _by_model(W, n, K, k + 3, L)
+        c4, c5, c6, c7 = (
+            _by_model(W, n, K, k + 4, L), _by_model(W, n, K, k + 5, L), _by_model(W, n, K, k + 6, L), _by_model(W, n, K, k + 7, L),
+        )  # fmt: skip
+        for r in range(3):
+            at = size * r + k - first + (WIDTH if first > 0 else 0)
+            _write_rows((c0[r], c1[r], c2[r], c3[r], c4[r], c5[r], c6[r], c7[r]), columns, row, many, at)
+
+
+@inlined
+def _add_point_model(Jk, K, J, p00, p01, p10, p11, w00, w01, w11, W, n):  # type: ignore[no-untyped-def]
+    """W[n] (3, K, 8) += Jpᵀ pᵀ W Jk of an observation of each of eight points, J the derivative of (a, b) by the point."""
+    for k in range(K):
+        j0, j1 = load(Jk, WIDTH * k), load(Jk, WIDTH * (K + k))
+        x, y = w00 * j0 + w01 * j1, w01 * j0 + w11 * j1
+        u, v = p00 * x + p10 * y, p01 * x + p11 * y
+        _add(W, 3 * K * n + k, u * J[0] + v * J[3])
+        _add(W, 3 * K * n + K + k, u * J[1] + v * J[4])
+        _add(W, 3 * K * n + 2 * K + k, u * J[2] + v * J[5])
+
+
+@inlined
+def _subtract_products(columns, blocks, num, wide, wide_shared, width, num_shared, z, sums):  # type: ignore[no-untyped-def]
+    """sums -= Vᵀ [V z], upper triangle of blocks, V the `num` blocks of a point, the last one of shared parameters if there are any.
+
+    The rows of `columns` that make V are in `blocks`; a block is `wide` columns wide, filled up with zeros, the last `wide_shared`.
+    """
+    stride, N = sums.shape[1], sums.shape[0] - 1
+    size = columns.shape[1] // 3
+    for i in range(num):
+        is_shared = num_shared > 0 and i == num - 1
+        V, row, rows = columns[blocks[i, 0]], blocks[i, 1], num_shared if is_shared else width
+        for m in range(0, rows - rows % 3, 3):
+            u0, v0, w0 = V[m], V[size + m], V[2 * size + m]
+            u1, v1, w1 = V[m + 1], V[size + m + 1], V[2 * size + m + 1]
+            u2, v2, w2 = V[m + 2], V[size + m + 2], V[2 * size + m + 2]
+            for j in range(i, num):
+                at, to = 3 * size * blocks[j, 0], stride * (row + m) + blocks[j, 2]
+                for n in range(0, wide_shared if num_shared > 0 and j == num - 1 else wide, WIDTH):
+                    x, y, w = load(columns, at + n), load(columns, at + size + n), load(columns, at + 2 * size + n)
+                    d0, d1, d2 = load(sums, to + n), load(sums, to + stride + n), load(sums, to + 2 * stride + n)
+                    store(sums, to + n, d0 - u0 * x - v0 * y - w0 * w)
+                    store(sums, to + stride + n, d1 - u1 * x - v1 * y - w1 * w)
+                    store(sums, to + 2 * stride + n, d2 - u2 * x - v2 * y - w2 * w)
+        for m in range(rows - rows % 3, rows):
+            for j in range(i, num):
+                at, to = 3 * size * blocks[j, 0], stride * (row + m) + blocks[j, 2]
+                for n in range(0, wide_shared if num_shared > 0 and j == num - 1 else wide, WIDTH):
+                    x, y, w = load(columns, at + n), load(columns, at + size + n), load(columns, at + 2 * size + n)
+                    store(sums, to + n, load(sums, to + n) - V[m] * x - V[size + m] * y - V[2 * size + m] * w)
+    for j in range(num):
+        at, to = 3 * size * blocks[j, 0], stride * N + blocks[j, 2]
+        for n in range(0, wide_shared if num_shared > 0 and j == num - 1 else wide, WIDTH):
+            x, y, w = load(columns, at + n), load(columns, at + size + n), load(columns, at + 2 * size + n)
+            store(sums, to + n, load(sums, to + n) - z[0] * x - z[1] * y - z[2] * w)
+
+
+@inlined
+def _eliminate(cameras, slot, first_row, num_shared, z, equations, scratch):  # type: ignore[no-untyped-def]
+    """Subtracts what a point that `cameras` see knows from `sums`; its rows of `columns` begin at first_row."""
+    F, D = equations.H_cameras.shape[0], equations.H_cameras.shape[1]
+    wide, wide_shared = -(-D // WIDTH) * WIDTH, -(-num_shared // WIDTH) * WIDTH
+    blocks, num, longest = scratch.blocks, 0, scratch.terms.shape[0] - 1
+    for n in range(cameras.shape[0]):
+        f = slot[cameras[n]]
+        if f >= 0:
+            blocks[num, 0], blocks[num, 1], blocks[num, 2] = first_row + n, D * f, wide * f
+            num += 1
+    if num_shared > 0:
+        blocks[num, 0], blocks[num, 1], blocks[num, 2] = first_row + longest, D * F, wide * F
+        num += 1
+    _subtract_products(scratch.columns, blocks, num, wide, wide_shared, D, num_shared, z, equations.sums)
+
+
+@kernel
+def _read_sums(equations, num_shared):  # type: ignore[no-untyped-def]
+    """Moves `sums` to `reduced` and `lifted`."""
+    sums, F, D = equations.sums, equations.H_cameras.shape[0], equations.H_cameras.shape[1]
+    N, wide = sums.shape[0] - 1, -(-D // WIDTH) * WIDTH
+    for row in range(N + 1):
+        begin = 0 if row == N else min(row // D, F)
+        out = equations.lifted if row == N else equations.reduced[row]
+        sign = -1.0 if row == N else 1.0
+        for f in range(begin, F + (num_shared > 0)):
+            for m in range(D if f < F else num_shared):
+                out[D * f + m] = sign * sums[row, wide * f + m]
+        sums[row] = 0.0
+
+
+@kernel
+def _accumulate_points(views, sightings, points, basis, inverse_squared_sigma, most_bend, damping, equations, scratch):  # type: ignore[no-untyped-def]
+    slot, terms, Jk, W, columns = views.slot, scratch.terms, scratch.Jk, scratch.W, scratch.columns
+    K, D = basis.shape[1], equations.H_cameras.shape[1]
+    is_own, is_distorted = D > 6, models_are_distorted(views.models)
+    num_shared, many, nothing = 0 if is_own else K, terms.shape[0], (lanes(0.0), lanes(0.0), lanes(0.0))
+    cost = 0.0
+    for g in range(0, points.shape[0], WIDTH):
+        p, is_new, first, count, longest = point_group(sightings, g)
+        X, Y, Z = points_of(points, p)
+        block, costs = no_point(), lanes(0.0)
+        if num_shared > 0:
+            W[0] = 0.0
+        for n in range(longest):
+            is_there, _, pose, model, seen = linearize_sighting(views, sightings, is_distorted, X, Y, Z, first, count, n)
+            is_seen, q, a, b, r0, r1, p00, p01, p10, p11 = seen
+            rho, _, g00, g01, g11, h0, h1, w00, w01, w11 = information(
+                is_there, is_seen, r0, r1, p00, p01, p10, p11, inverse_squared_sigma, most_bend
+            )
+            costs = costs + rho
+            J = by_point(pose, q, a, b)
+            x = weighted(J, g00, g01, g11)
+            block = add_point(block, J, x, h0, h1)
+            k = 9 * WIDTH * n
+            store(terms, k, q)
+            store(terms, k + WIDTH, a)
+            store(terms, k + 2 * WIDTH, b)
+            for m in range(6):
+                store(terms, k + (3 + m) * WIDTH, x[m])
+            if K > 0:
+                by_parameters(a, b, model, basis, Jk)
+                if is_own:
+                    W[n] = 0.0
+                _add_point_model(Jk, K, J, p00, p01, p10, p11, w00, w01, w11, W, n if is_own else 0)
+        cost += total(select(is_new, costs, 0.0))
+        _, L = inverse_root(block, damping, count)
+        z = lifted_gradient(L, block[6], block[7], block[8])
+        for m in range(3):
+            scatter(equations.point_gradient, 3 * p + m, block[6 + m])
+            store(scratch.z, WIDTH * m, z[m])
+        for m in range(6):
+            scatter(equations.root, 6 * p + m, L[m])
+        for n in range(longest):
+            more = (_by_model(W, n, K, 0, L), _by_model(W, n, K, 1, L)) if is_own else (nothing, nothing)
+            _pose_columns(terms, n, L, more, columns, many)
             if is_own:
-                _model_columns(W, i, L0, L1, L2, L3, L4, L5, V, D * i + 6)
-            for m in range(D):
-                lifted[column[i] + m] += V[0, D * i + m] * z0 + V[1, D * i + m] * z1 + V[2, D * i + m] * z2
-        blocks, num_columns = num, D * num
-        if K > 0 and not is_own:
-            _model_columns(W, 0, L0, L1, L2, L3, L4, L5, V, num_columns)
-            for m in range(K):
-                n = num_columns + m
-                lifted[D * F + m] += V[0, n] * z0 + V[1, n] * z1 + V[2, n] * z2
-            column[num] = D * F
-            blocks, num_columns = num + 1, num_columns + K
-        for i in range(blocks - 1, -1, -1):
-            end[i] = end[i + 1] if i + 1 < num and column[i + 1] == column[i] + D else i + 1
-        _subtract_products(V, blocks, D, num_columns, column, end, S)
+                _model_columns(W, n, K, 2, L, columns, n, many)
+        if num_shared > 0:
+            _model_columns(W, 0, K, 0, L, columns, many - 1, many)
+        for lane in range(min(WIDTH, points.shape[0] - g)):
+            number = sightings.by_length[g + lane]
+            seen_by = sightings.camera[sightings.starts[number] : sightings.starts[number + 1]]
+            if equations.root[number, 0] != 0.0:
+                z = (scratch.z[0, lane], scratch.z[1, lane], scratch.z[2, lane])
+                _eliminate(seen_by, slot, many * lane, num_shared, z, equations, scratch)
+    _read_sums(equations, num_shared)
     return cost
 
 
@@ -415,8 +517,14 @@ def accumulate(
         most_bend: see `information`.
     """
     equations.clear()
-    scratch = _scratch(sightings.starts, equations.H_cameras.shape[1], basis.shape[1])
-    return float(_accumulate(views, sightings, points, basis, inverse_squared_sigma, most_bend, damping, equations, scratch))
+    K = basis.shape[1]
+    of_cameras = _CameraScratch(np.empty(27), np.empty((2, K, WIDTH)), np.empty((7 + K, K, WIDTH)))
+    _accumulate_cameras(views, sightings, points, basis, inverse_squared_sigma, most_bend, equations, of_cameras)
+    scratch = _scratch(sightings, equations.H_cameras.shape[1], K)
+    return float(_accumulate_points(views, sightings, points, basis, inverse_squared_sigma, most_bend, damping, equations, scratch))
+
+
+# --- the step ----------------------------------------------------------------------------------------------------
 
 
 @kernel
@@ -430,82 +538,74 @@ def move_cameras(views, delta, R_new, t_new):  # type: ignore[no-untyped-def]
             R_new[c], t_new[c] = views.R[c], views.t[c]
 
 
+@inlined
+def _lead(slot, c, q, a, b, delta):  # type: ignore[no-untyped-def]
+    """How far (a, b) moves with the steps delta (F, D) of cameras c; fixed ones stay."""
+    f, D = gather(slot, c), delta.shape[1]
+    is_free, at = f >= 0, D * f
+    at = select(is_free, at, 0)
+    d0, d1, d2 = gather(delta, at), gather(delta, at + 1), gather(delta, at + 2)
+    d3, d4, d5 = gather(delta, at + 3), gather(delta, at + 4), gather(delta, at + 5)
+    turn = b * d3 - a * d4 + q * d2
+    da, db = q * d0 + d4 - b * d5 - a * turn, q * d1 - d3 + a * d5 - b * turn
+    return select(is_free, da, 0.0), select(is_free, db, 0.0)
+
+
+@inlined
+def _model_lead(a, b, model, moved):  # type: ignore[no-untyped-def]
+    """How far the pixels move with the camera models."""
+    d = model_derivatives(a, b, model)
+    s0, s1, s2, s3 = moved[0] - model[0], moved[1] - model[1], moved[2] - model[2], moved[3] - model[3]
+    s4, s5, s6, s7 = moved[4] - model[4], moved[5] - model[5], moved[6] - model[6], moved[7] - model[7]
+    u = d[0] * s0 + s2 + d[1] * s4 + d[2] * s5 + d[3] * s6 + d[4] * s7
+    return u, d[5] * s1 + s3 + d[6] * s4 + d[7] * s5 + d[8] * s6 + d[9] * s7
+
+
 @kernel
 def move_points(views, moved, sightings, points, delta, inverse_squared_sigma, most_bend, equations, out):  # type: ignore[no-untyped-def]
     """Eq. 10: out (P, 3) = the points after the cameras went from `views` to `moved` by delta (F, D); returns the cost there."""
-    R, t, slot, models = views
-    starts, cameras, pixels = sightings
-    distorted, many, now_distorted = models_are_distorted(models), models.shape[0] > 1, models_are_distorted(moved.models)
+    models, slot = views.models, views.slot
+    is_distorted, now_distorted = models_are_distorted(models), models_are_distorted(moved.models)
     is_model_free = False
     for m in range(models.shape[0]):
         for k in range(8):
             is_model_free |= models[m, k] != moved.models[m, k]
-    root, point_gradient, J = equations.root, equations.point_gradient, np.empty((2, 8))
-    R_new, t_new, models_new = moved.R, moved.t, moved.models
+    root, point_gradient, is_some_free = equations.root, equations.point_gradient, delta.shape[0] > 0
     cost = 0.0
-    for p in range(points.shape[0]):
-        g0, g1, g2 = point_gradient[p, 0], point_gradient[p, 1], point_gradient[p, 2]
-        for i in range(starts[p], starts[p + 1]):
-            c = cameras[i]
-            f = slot[c]
-            if f < 0 and not is_model_free:
-                continue
-            m = c if many else 0
-            q, a, b, r0, r1, p00, p01, p10, p11 = linearize_observation(R, t, c, models, m, distorted, points, p, pixels, i)
-            if q == 0.0:
-                continue
-            _, g00, g01, g11, _, _, w00, w01, w11 = information(r0, r1, p00, p01, p10, p11, inverse_squared_sigma, most_bend)
-            h0, h1 = 0.0, 0.0
-            if f >= 0:
-                turn = b * delta[f, 3] - a * delta[f, 4] + q * delta[f, 2]
-                da = q * delta[f, 0] + delta[f, 4] - b * delta[f, 5] - a * turn
-                db = q * delta[f, 1] - delta[f, 3] + a * delta[f, 5] - b * turn
+    for g in range(0, points.shape[0], WIDTH):
+        p, is_new, first, count, longest = point_group(sightings, g)
+        X, Y, Z = points_of(points, p)
+        g0, g1, g2 = points_of(point_gradient, p)
+        for n in range(longest if is_some_free or is_model_free else 0):
+            is_there, c, pose, model, seen = linearize_sighting(views, sightings, is_distorted, X, Y, Z, first, count, n)
+            is_seen, q, a, b, r0, r1, p00, p01, p10, p11 = seen
+            _, _, g00, g01, g11, _, _, w00, w01, w11 = information(
+                is_there, is_seen, r0, r1, p00, p01, p10, p11, inverse_squared_sigma, most_bend
+            )
+            h0, h1 = lanes(0.0), lanes(0.0)
+            if is_some_free:
+                da, db = _lead(slot, c, q, a, b, delta)
                 h0, h1 = g00 * da + g01 * db, g01 * da + g11 * db
             if is_model_free:
-                model_derivatives(models, m, a, b, J)
-                x, y = 0.0, 0.0
-                for k in range(8):
-                    x += J[0, k] * (models_new[m, k] - models[m, k])
-                    y += J[1, k] * (models_new[m, k] - models[m, k])
+                to = models_of(moved.models, c) if models.shape[0] > 1 else model_of(moved.models, 0)
+                x, y = _model_lead(a, b, model, to)
                 u, v = w00 * x + w01 * y, w01 * x + w11 * y
-                h0 += p00 * u + p10 * v
-                h1 += p01 * u + p11 * v
-            hz = a * h0 + b * h1
-            g0 += q * (h0 * R[c, 0, 0] + h1 * R[c, 1, 0] - hz * R[c, 2, 0])
-            g1 += q * (h0 * R[c, 0, 1] + h1 * R[c, 1, 1] - hz * R[c, 2, 1])
-            g2 += q * (h0 * R[c, 0, 2] + h1 * R[c, 1, 2] - hz * R[c, 2, 2])
-        L0, L1, L2, L3, L4, L5 = root[p, 0], root[p, 1], root[p, 2], root[p, 3], root[p, 4], root[p, 5]
-        x, y, z = L0 * g0, L1 * g0 + L3 * g1, L2 * g0 + L4 * g1 + L5 * g2
-        out[p, 0] = points[p, 0] - (L0 * x + L1 * y + L2 * z)
-        out[p, 1] = points[p, 1] - (L3 * y + L4 * z)
-        out[p, 2] = points[p, 2] - L5 * z
-        for i in range(starts[p], starts[p + 1]):
-            c = cameras[i]
-            e = observation_error(R_new, t_new, c, models_new, c if many else 0, now_distorted, out, p, pixels, i)
-            cost += 1.0 / inverse_squared_sigma if e == np.inf else geman_mcclure(e, inverse_squared_sigma)[0]
+                h0, h1 = h0 + p00 * u + p10 * v, h1 + p01 * u + p11 * v
+            J = by_point(pose, q, a, b)
+            g0, g1, g2 = g0 + (h0 * J[0] + h1 * J[3]), g1 + (h0 * J[1] + h1 * J[4]), g2 + (h0 * J[2] + h1 * J[5])
+        r = 6 * p
+        L = (gather(root, r), gather(root, r + 1), gather(root, r + 2), gather(root, r + 3), gather(root, r + 4), gather(root, r + 5))
+        d0, d1, d2 = point_step(L, g0, g1, g2)
+        X, Y, Z = X - d0, Y - d1, Z - d2
+        scatter(out, 3 * p, X)
+        scatter(out, 3 * p + 1, Y)
+        scatter(out, 3 * p + 2, Z)
+        costs = lanes(0.0)
+        for n in range(longest):
+            is_there, e = squared_error_sighting(moved, sightings, now_distorted, X, Y, Z, first, count, n)
+            costs = costs + robust_cost(is_there, e, inverse_squared_sigma)
+        cost += total(select(is_new, costs, 0.0))
     return cost
-
-
-@kernel
-def squared_errors(views, sightings, points, out):  # type: ignore[no-untyped-def]
-    """|r|² (M,) of the observations in pixels², inf behind the camera."""
-    R, t, _, models = views
-    starts, cameras, pixels = sightings
-    distorted, many = models_are_distorted(models), models.shape[0] > 1
-    for p in range(points.shape[0]):
-        for i in range(starts[p], starts[p + 1]):
-            c = cameras[i]
-            out[i] = observation_error(R, t, c, models, c if many else 0, distorted, points, p, pixels, i)
-
-
-@kernel
-def squared_errors_by_row(views, obs_camera, obs_point, pixels, points, out):  # type: ignore[no-untyped-def]
-    """`squared_errors` of observations in any order."""
-    R, t, _, models = views
-    distorted, many = models_are_distorted(models), models.shape[0] > 1
-    for i in range(obs_camera.shape[0]):
-        c = obs_camera[i]
-        out[i] = observation_error(R, t, c, models, c if many else 0, distorted, points, obs_point[i], pixels, i)
 
 
 @kernel

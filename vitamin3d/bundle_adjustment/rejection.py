@@ -7,7 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from vitamin3d.bundle_adjustment.problem import BundleProblem, make_problem
-from vitamin3d.bundle_adjustment.variables import squared_errors_of
+from vitamin3d.bundle_adjustment.variables import Variables, squared_errors_of
 from vitamin3d.types import Array
 
 FARTHEST = 1e8
@@ -54,8 +54,8 @@ def reject(problem: BundleProblem, models: Array, min_camera_observations: int =
     duplicate[first] = False
     at_infinity = finite_points & (_distance(problem, finite_points, finite_cameras) > FARTHEST)
     keep = ~(not_finite | duplicate | at_infinity[point])
-    behind = keep.copy()
-    behind[keep] = np.isinf(squared_errors_of(with_observations(problem, keep), models))
+    behind, part = keep.copy(), with_observations(problem, keep)
+    behind[keep] = np.isinf(squared_errors_of(part, Variables.of(part, models)))
     keep &= ~behind
     kept, weak = _until_stable(problem, keep, min_camera_observations)
     seen_once = (np.bincount(point, minlength=len(finite_points)) > 0) & finite_points & ~at_infinity

@@ -10,15 +10,14 @@ from scipy.linalg import lapack
 from vitamin3d.bundle_adjustment.marginalization import CameraPrior
 from vitamin3d.bundle_adjustment.normal_equations import (
     NormalEquations,
-    Sightings,
     accumulate,
     move_cameras,
     move_points,
     scale_upper,
-    squared_errors,
 )
+from vitamin3d.bundle_adjustment.observations import Sightings, squared_errors
 from vitamin3d.bundle_adjustment.problem import BundleProblem
-from vitamin3d.bundle_adjustment.subspace import Scratch, new_scratch, sweep_points
+from vitamin3d.bundle_adjustment.subspace import sweep_points
 from vitamin3d.bundle_adjustment.variables import Progress, Variables, free_slots, pinhole_model, sightings_of
 from vitamin3d.geometry.camera import Camera
 from vitamin3d.types import Array, BundleReport
@@ -132,9 +131,9 @@ class ReducedSystem:
         return moved
 
     def squared_errors(self, variables: Variables) -> Array:
-        """(M,) in pixels², in the order of the sightings."""
-        out = np.empty(len(self.sightings.camera))
-        squared_errors(variables.views(self.slot), self.sightings, variables.points, out)
+        """(M,) in pixels², in the problem's order."""
+        out, (*_, starts, point, pixels) = np.empty(len(self.sightings.camera)), self.sightings
+        squared_errors(variables.views(self.slot), starts, point, pixels, variables.points, out)
         return out
 
 
@@ -211,10 +210,10 @@ def minimise(
 
     With `is_settled`, which is asked about each step and its damping, that must be so as well.
     """
-    progress, damping, is_near, scratch = Progress(), first_damping, False, new_scratch()
+    progress, damping, is_near = Progress(), first_damping, False
     for _ in range(iterations):
         step = system.step(variables, damping, MOST_BEND if is_near else 0.0)
-        cost = _swept(system, step, point_sweeps, scratch)
+        cost = _swept(system, step, point_sweeps)
         if not progress.costs:
             progress.costs.append(step.cost_before)
         accepted = cost <= progress.costs[-1]
@@ -239,11 +238,11 @@ def minimise(
     return variables, progress
 
 
-def _swept(system: ReducedSystem, step: Step, sweeps: int, scratch: Scratch) -> float:
+def _swept(system: ReducedSystem, step: Step, sweeps: int) -> float:
     """The cost after the step and so many sweeps over its points."""
     cost = step.cost
     for _ in range(sweeps if np.isfinite(cost) else 0):
         views = step.moved.views(system.slot)
-        *_, cost = sweep_points(views, system.sightings, step.moved.points, system.inverse_squared_sigma, scratch)
+        *_, cost = sweep_points(views, system.sightings, step.moved.points, system.inverse_squared_sigma)
         cost += system.prior_cost(step.moved, step.shared)
     return cost

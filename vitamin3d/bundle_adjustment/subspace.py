@@ -10,21 +10,34 @@ from typing import NamedTuple
 
 import numpy as np
 
-from vitamin3d._jit import inlined, kernel
+from vitamin3d._jit import kernel
+from vitamin3d._lanes import WIDTH, any_of, greatest, lanes, scatter, select, total
 from vitamin3d.bundle_adjustment.normal_equations import (
     add_camera,
-    information,
+    add_point,
+    by_point,
     inverse_root,
-    linearize_observation,
+    no_camera,
+    no_point,
+    point_step,
+    weighted,
+    write_camera,
+)
+from vitamin3d.bundle_adjustment.observations import (
+    cost_of_camera,
+    information,
+    linearize_rows,
+    linearize_sighting,
     models_are_distorted,
-    observation_error,
-    squared_errors,
+    point_group,
+    robust_cost,
+    squared_error_sighting,
+    total_cost,
 )
 from vitamin3d.bundle_adjustment.problem import BundleProblem
-from vitamin3d.bundle_adjustment.variables import Progress, Variables, free_slots, pinhole_model, sightings_of
+from vitamin3d.bundle_adjustment.variables import Progress, Variables, free_slots, pinhole_model, sightings_of, squared_errors_of
 from vitamin3d.geometry.camera import Camera
-from vitamin3d.geometry.reprojection import retract
-from vitamin3d.geometry.robust import geman_mcclure
+from vitamin3d.geometry.reprojection import model_of, points_of, pose_of, retract
 from vitamin3d.types import Array, BundleReport
 
 BLOCK_DAMPING = 1e-9
@@ -33,20 +46,11 @@ MIN_OBSERVATIONS = 6
 """A camera with fewer is left where it is."""
 
 
-class ByCamera(NamedTuple):
-    """The observations sorted by camera, for the kernels."""
-
-    starts: Array
-    """(C + 1,) int64."""
-    point: Array
-    """(M,) int32."""
-    pixels: Array
-    """(M, 2)."""
-
-
 class Scratch(NamedTuple):
-    """Memory of the sweeps: a block, its right-hand side and step, and where it would lead."""
+    """Memory of a sweep over cameras: a block, its right-hand side and step, and where it would lead."""
 
+    sums: Array
+    """(27,)."""
     H: Array
     """(1, 6, 6)."""
     g: Array
@@ -57,19 +61,11 @@ class Scratch(NamedTuple):
     """(1, 3, 3)."""
     t: Array
     """(1, 3)."""
-    X: Array
-    """(1, 3)."""
 
 
 def new_scratch() -> Scratch:
     """Memory for the sweeps."""
-    return Scratch(*(np.empty(shape) for shape in ((1, 6, 6), 6, 6, (1, 3, 3), (1, 3), (1, 3))))
-
-
-@inlined
-def _rho(e, inverse_squared_sigma):  # type: ignore[no-untyped-def]
-    """The robust cost of |r|²; a point behind the camera costs what the farthest outlier does."""
-    return 1.0 / inverse_squared_sigma if e == np.inf else geman_mcclure(e, inverse_squared_sigma)[0]
+    return Scratch(*(np.empty(shape) for shape in (27, (1, 6, 6), 6, 6, (1, 3, 3), (1, 3))))
 
 
 @kernel
@@ -100,32 +96,30 @@ def solve_6x6(H, g, delta):  # type: ignore[no-untyped-def]
 
 
 @kernel
-def sweep_cameras(views, by_camera, points, inverse_squared_sigma, scratch):  # type: ignore[no-untyped-def]
+def sweep_cameras(views, sightings, points, inverse_squared_sigma, scratch):  # type: ignore[no-untyped-def]
     """Eq. 11 for each free camera, in place: a Gauss–Newton step, halved while the cost rises, else not taken.
 
     Returns the largest norm of a tangent taken, and the squared norm of the gradient.
     """
     R, t, slot, models = views
-    starts, obs_point, pixels = by_camera
-    H, g, delta, R_new, t_new, _ = scratch
-    distorted, many = models_are_distorted(models), models.shape[0] > 1
-    largest, squared_gradient = 0.0, 0.0
+    sums, H, g, delta, R_new, t_new = scratch
+    is_distorted, largest, squared_gradient = models_are_distorted(models), 0.0, 0.0
     for c in range(R.shape[0]):
-        first, last = starts[c], starts[c + 1]
+        first, last = sightings.camera_starts[c], sightings.camera_starts[c + 1]
         if slot[c] < 0 or last - first < MIN_OBSERVATIONS:
             continue
-        H[0, :, :] = 0.0
-        g[:] = 0.0
-        before, m = 0.0, c if many else 0
-        for i in range(first, last):
-            p = obs_point[i]
-            q, a, b, r0, r1, p00, p01, p10, p11 = linearize_observation(R, t, c, models, m, distorted, points, p, pixels, i)
-            if q == 0.0:
-                before += 1.0 / inverse_squared_sigma
-                continue
-            rho, g00, g01, g11, h0, h1, _, _, _ = information(r0, r1, p00, p01, p10, p11, inverse_squared_sigma, 0.0)
-            before += rho
-            add_camera(H, 0, g, 0, q, a, b, g00, g01, g11, h0, h1)
+        pose, model = pose_of(R, t, c), model_of(models, c if models.shape[0] > 1 else 0)
+        block, costs = no_camera(), lanes(0.0)
+        for i in range(first, last, WIDTH):
+            is_there, seen = linearize_rows(sightings, points, pose, model, is_distorted, i, last)
+            is_seen, q, a, b, r0, r1, p00, p01, p10, p11 = seen
+            rho, _, g00, g01, g11, h0, h1, _, _, _ = information(
+                is_there, is_seen, r0, r1, p00, p01, p10, p11, inverse_squared_sigma, 0.0
+            )
+            costs = costs + rho
+            block = add_camera(block, q, a, b, g00, g01, g11, h0, h1)
+        before = total(costs)
+        write_camera(block, sums, H[0], g)
         for k in range(6):
             H[0, k, k] += BLOCK_DAMPING * H[0, k, k] + 1e-12
             squared_gradient += g[k] * g[k]
@@ -133,12 +127,8 @@ def sweep_cameras(views, by_camera, points, inverse_squared_sigma, scratch):  # 
             continue
         for _ in range(STEP_HALVINGS):
             retract(delta, R[c], t[c], R_new[0], t_new[0])
-            after = 0.0
-            for i in range(first, last):
-                after += _rho(
-                    observation_error(R_new, t_new, 0, models, m, distorted, points, obs_point[i], pixels, i), inverse_squared_sigma
-                )
-            if after <= before:
+            there = pose_of(R_new, t_new, 0)
+            if cost_of_camera(sightings, points, there, model, is_distorted, first, last, inverse_squared_sigma) <= before:
                 R[c], t[c] = R_new[0], t_new[0]
                 size = 0.0
                 for k in range(6):
@@ -150,86 +140,51 @@ def sweep_cameras(views, by_camera, points, inverse_squared_sigma, scratch):  # 
 
 
 @kernel
-def sweep_points(views, sightings, points, inverse_squared_sigma, scratch):  # type: ignore[no-untyped-def]
+def sweep_points(views, sightings, points, inverse_squared_sigma):  # type: ignore[no-untyped-def]
     """Eq. 12 for each point with two observations, in place: a Gauss–Newton step, halved while the cost rises, else not taken.
 
     Returns the largest distance moved, the squared norm of the gradient, and the cost after the sweep.
     """
-    R, t, _, models = views
-    starts, cameras, pixels = sightings
-    X = scratch.X
-    distorted, many = models_are_distorted(models), models.shape[0] > 1
-    largest, squared_gradient, cost = 0.0, 0.0, 0.0
-    for p in range(points.shape[0]):
-        first, last, before = starts[p], starts[p + 1], 0.0
-        H0, H1, H2, H3, H4, H5, g0, g1, g2 = 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0
-        for i in range(first, last):
-            c = cameras[i]
-            m = c if many else 0
-            q, a, b, r0, r1, p00, p01, p10, p11 = linearize_observation(R, t, c, models, m, distorted, points, p, pixels, i)
-            if q == 0.0:
-                before += 1.0 / inverse_squared_sigma
-                continue
-            rho, g00, g01, g11, h0, h1, _, _, _ = information(r0, r1, p00, p01, p10, p11, inverse_squared_sigma, 0.0)
-            before += rho
-            s0, s1, s2 = q * (R[c, 0, 0] - a * R[c, 2, 0]), q * (R[c, 0, 1] - a * R[c, 2, 1]), q * (R[c, 0, 2] - a * R[c, 2, 2])
-            t0, t1, t2 = q * (R[c, 1, 0] - b * R[c, 2, 0]), q * (R[c, 1, 1] - b * R[c, 2, 1]), q * (R[c, 1, 2] - b * R[c, 2, 2])
-            x0, x1, x2 = g00 * s0 + g01 * t0, g00 * s1 + g01 * t1, g00 * s2 + g01 * t2
-            y0, y1, y2 = g01 * s0 + g11 * t0, g01 * s1 + g11 * t1, g01 * s2 + g11 * t2
-            H0 += s0 * x0 + t0 * y0
-            H1 += s0 * x1 + t0 * y1
-            H2 += s0 * x2 + t0 * y2
-            H3 += s1 * x1 + t1 * y1
-            H4 += s1 * x2 + t1 * y2
-            H5 += s2 * x2 + t2 * y2
-            g0 += h0 * s0 + h1 * t0
-            g1 += h0 * s1 + h1 * t1
-            g2 += h0 * s2 + h1 * t2
-        squared_gradient += g0 * g0 + g1 * g1 + g2 * g2
-        more = 1.0 + BLOCK_DAMPING
-        L0, L1, L2, L3, L4, L5 = inverse_root(more * H0, H1, H2, more * H3, H4, more * H5)
-        if last - first < 2 or L0 == 0.0:
-            cost += before
-            continue
-        x, y, z = L0 * g0, L1 * g0 + L3 * g1, L2 * g0 + L4 * g1 + L5 * g2
-        d0, d1, d2 = L0 * x + L1 * y + L2 * z, L3 * y + L4 * z, L5 * z
+    is_distorted = models_are_distorted(views.models)
+    farthest, squared_gradient, cost = lanes(0.0), lanes(0.0), lanes(0.0)
+    for start in range(0, points.shape[0], WIDTH):
+        p, is_new, first, count, longest = point_group(sightings, start)
+        if longest == 0:
+            break
+        X, Y, Z = points_of(points, p)
+        block, before = no_point(), lanes(0.0)
+        for n in range(longest):
+            is_there, _, pose, _, seen = linearize_sighting(views, sightings, is_distorted, X, Y, Z, first, count, n)
+            is_seen, q, a, b, r0, r1, p00, p01, p10, p11 = seen
+            rho, _, g00, g01, g11, h0, h1, _, _, _ = information(
+                is_there, is_seen, r0, r1, p00, p01, p10, p11, inverse_squared_sigma, 0.0
+            )
+            before = before + rho
+            J = by_point(pose, q, a, b)
+            block = add_point(block, J, weighted(J, g00, g01, g11), h0, h1)
+        g0, g1, g2 = block[6], block[7], block[8]
+        squared_gradient = squared_gradient + select(is_new, g0 * g0 + g1 * g1 + g2 * g2, 0.0)
+        is_open, L = inverse_root(block, BLOCK_DAMPING, count)
+        d0, d1, d2 = point_step(L, g0, g1, g2)
         best = before
         for _ in range(STEP_HALVINGS):
-            X[0, 0], X[0, 1], X[0, 2] = points[p, 0] - d0, points[p, 1] - d1, points[p, 2] - d2
-            after = 0.0
-            for i in range(first, last):
-                c = cameras[i]
-                e = observation_error(R, t, c, models, c if many else 0, distorted, X, 0, pixels, i)
-                after += _rho(e, inverse_squared_sigma)
-            if after <= before:
-                points[p, 0], points[p, 1], points[p, 2] = X[0, 0], X[0, 1], X[0, 2]
-                largest = max(largest, np.sqrt(d0 * d0 + d1 * d1 + d2 * d2))
-                best = after
+            x, y, z, after = X - d0, Y - d1, Z - d2, lanes(0.0)
+            for n in range(longest):
+                is_there, e = squared_error_sighting(views, sightings, is_distorted, x, y, z, first, count, n)
+                after = after + robust_cost(is_there, e, inverse_squared_sigma)
+            is_better = is_open & (after <= before)
+            X, Y, Z, best = select(is_better, x, X), select(is_better, y, Y), select(is_better, z, Z), select(is_better, after, best)
+            way = d0 * d0 + d1 * d1 + d2 * d2
+            farthest = select(is_better & (way > farthest), way, farthest)
+            is_open = is_open ^ is_better
+            if not any_of(is_open):
                 break
             d0, d1, d2 = 0.5 * d0, 0.5 * d1, 0.5 * d2
-        cost += best
-    return largest, squared_gradient, cost
-
-
-@kernel
-def total_cost(views, sightings, points, inverse_squared_sigma):  # type: ignore[no-untyped-def]
-    """The robust cost, pixels²."""
-    R, t, _, models = views
-    starts, cameras, pixels = sightings
-    distorted, many = models_are_distorted(models), models.shape[0] > 1
-    total = 0.0
-    for p in range(points.shape[0]):
-        for i in range(starts[p], starts[p + 1]):
-            c = cameras[i]
-            e = observation_error(R, t, c, models, c if many else 0, distorted, points, p, pixels, i)
-            total += _rho(e, inverse_squared_sigma)
-    return total
-
-
-def by_camera_of(problem: BundleProblem) -> ByCamera:
-    """The observations as the problem has them, with where each camera's start."""
-    starts = np.searchsorted(problem.obs_camera, np.arange(len(problem.T_cam_world) + 1))
-    return ByCamera(starts, problem.obs_point, np.ascontiguousarray(problem.obs_pixels))
+        scatter(points, 3 * p, X)
+        scatter(points, 3 * p + 1, Y)
+        scatter(points, 3 * p + 2, Z)
+        cost = cost + select(is_new, best, 0.0)
+    return np.sqrt(greatest(farthest)), total(squared_gradient), total(cost)
 
 
 def adjust_subspace(
@@ -242,19 +197,17 @@ def adjust_subspace(
     """
     variables = Variables.of(problem, pinhole_model(camera))
     progress = sweep_until(problem, variables, 1.0 / sigma_px**2, sweeps, relative_gain)
-    out = np.empty(len(problem.obs_camera))
-    squared_errors(variables.views(free_slots(problem)), sightings_of(problem), variables.points, out)
-    return variables.written_to(problem), progress.report(out, sigma_px)
+    return variables.written_to(problem), progress.report(squared_errors_of(problem, variables), sigma_px)
 
 
 def sweep_until(problem: BundleProblem, variables: Variables, weight: float, sweeps: int, relative_gain: float) -> Progress:
     """Sweeps over cameras and points, `variables` changed in place, until one gains less than a share of the cost; weight = 1 / sigma²."""
-    sightings, by_camera, scratch = sightings_of(problem), by_camera_of(problem), new_scratch()
+    sightings, scratch = sightings_of(problem), new_scratch()
     views, progress = variables.views(free_slots(problem)), Progress()
     progress.costs.append(total_cost(views, sightings, variables.points, weight))
     for _ in range(sweeps):
-        pose, by_pose = sweep_cameras(views, by_camera, variables.points, weight, scratch)
-        point, by_point, cost = sweep_points(views, sightings, variables.points, weight, scratch)
+        pose, by_pose = sweep_cameras(views, sightings, variables.points, weight, scratch)
+        point, by_point, cost = sweep_points(views, sightings, variables.points, weight)
         progress.costs.append(min(cost, progress.costs[-1]))
         progress.steps.append((float(np.sqrt(by_pose + by_point)), pose, point))
         if progress.costs[-2] - progress.costs[-1] <= relative_gain * progress.costs[-2]:

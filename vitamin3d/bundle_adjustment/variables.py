@@ -6,7 +6,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from vitamin3d.bundle_adjustment.normal_equations import Sightings, Views, squared_errors_by_row
+from vitamin3d.bundle_adjustment.observations import Sightings, Views, longest_first, squared_errors
 from vitamin3d.bundle_adjustment.problem import BundleProblem
 from vitamin3d.geometry.camera import Camera
 from vitamin3d.types import Array, BundleReport
@@ -46,10 +46,17 @@ def free_slots(problem: BundleProblem) -> Array:
     return np.where(problem.camera_is_free, np.cumsum(problem.camera_is_free) - 1, -1)
 
 
+def _camera_starts(problem: BundleProblem) -> Array:
+    return np.searchsorted(problem.obs_camera, np.arange(len(problem.T_cam_world) + 1))
+
+
 def sightings_of(problem: BundleProblem, pixels: Array | None = None) -> Sightings:
-    """The observations by point; with other `pixels` (M, 2), in the problem's order, where they are given."""
-    pixels, order = problem.obs_pixels if pixels is None else pixels, problem.point_order
-    return Sightings(problem.point_starts, problem.obs_camera[order], pixels[order])
+    """The observations in both orders; with other `pixels` (M, 2), in the problem's order, where they are given."""
+    pixels, order = np.ascontiguousarray(problem.obs_pixels if pixels is None else pixels), problem.point_order
+    by_length = np.empty(len(problem.points_world), np.int64)
+    longest_first(problem.point_starts, by_length)
+    by_point = problem.point_starts, problem.obs_camera[order], pixels[order], by_length
+    return Sightings(*by_point, _camera_starts(problem), np.ascontiguousarray(problem.obs_point), pixels)
 
 
 def pinhole_model(camera: Camera) -> Array:
@@ -57,17 +64,17 @@ def pinhole_model(camera: Camera) -> Array:
     return np.array([[camera.fx, camera.fy, camera.cx, camera.cy, 0.0, 0.0, 0.0, 0.0]])
 
 
-def squared_errors_of(problem: BundleProblem, models: Array) -> Array:
-    """|r|² (M,) of all observations in pixels², inf behind the camera; models (1, 8) or (C, 8)."""
-    out, variables = np.empty(len(problem.obs_camera)), Variables.of(problem, models)
-    views = variables.views(free_slots(problem))
-    squared_errors_by_row(views, problem.obs_camera, problem.obs_point, np.ascontiguousarray(problem.obs_pixels), variables.points, out)
+def squared_errors_of(problem: BundleProblem, variables: Variables) -> Array:
+    """|r|² (M,) of all observations of a problem in pixels², inf behind the camera."""
+    out, views = np.empty(len(problem.obs_camera)), variables.views(free_slots(problem))
+    pixels, points = (np.ascontiguousarray(a) for a in (problem.obs_pixels, variables.points))
+    squared_errors(views, _camera_starts(problem), np.ascontiguousarray(problem.obs_point), pixels, points, out)
     return out
 
 
 def squared_reprojection_errors(problem: BundleProblem, camera: Camera) -> Array:
     """|r|² (M,) of all observations, ideal pixels of `camera`, in pixels²; inf behind the camera."""
-    return squared_errors_of(problem, pinhole_model(camera))
+    return squared_errors_of(problem, Variables.of(problem, pinhole_model(camera)))
 
 
 @dataclass

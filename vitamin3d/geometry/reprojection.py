@@ -7,6 +7,7 @@ Residual r = projection(T_cam_world X) - u, pixels. The pose moves by `exp_se3([
 import numpy as np
 
 from vitamin3d._jit import inlined, kernel
+from vitamin3d._lanes import gather, lanes, select
 from vitamin3d.geometry.camera import distort
 from vitamin3d.types import Array
 
@@ -38,68 +39,115 @@ def linearize(intrinsics, R, t, X, pixel, r, J_pose, J_point):  # type: ignore[n
 
 
 @inlined
-def in_camera(R, t, c, points, n):  # type: ignore[no-untyped-def]
-    """x, y, z of point n in the frame of camera c.
-
-    The functions below take numbers and return numbers: numba counts references to arrays that it hands to a function
-    with branches, which takes longer than all the arithmetic.
-    """
-    X, Y, Z = points[n, 0], points[n, 1], points[n, 2]
-    x = R[c, 0, 0] * X + R[c, 0, 1] * Y + R[c, 0, 2] * Z + t[c, 0]
-    y = R[c, 1, 0] * X + R[c, 1, 1] * Y + R[c, 1, 2] * Z + t[c, 1]
-    return x, y, R[c, 2, 0] * X + R[c, 2, 1] * Y + R[c, 2, 2] * Z + t[c, 2]
+def pose_of(R, t, c):  # type: ignore[no-untyped-def]
+    """The twelve numbers of pose c: the rows of R (C, 3, 3), then t (C, 3)."""
+    return (
+        R[c, 0, 0], R[c, 0, 1], R[c, 0, 2], R[c, 1, 0], R[c, 1, 1], R[c, 1, 2], R[c, 2, 0], R[c, 2, 1], R[c, 2, 2],
+        t[c, 0], t[c, 1], t[c, 2],
+    )  # fmt: skip
 
 
 @inlined
-def linearize_normalized(x, y, z, is_distorted, fx, fy, cx, cy, k1, k2, p1, p2, u, v):  # type: ignore[no-untyped-def]
-    """The residual and its derivatives in few numbers: q, a, b, r0, r1, p00, p01, p10, p11; q = 0 behind the camera.
+def poses_of(R, t, c):  # type: ignore[no-untyped-def]
+    """`pose_of` for `Indices` c."""
+    r, s = 9 * c, 3 * c
+    return (
+        gather(R, r), gather(R, r + 1), gather(R, r + 2), gather(R, r + 3), gather(R, r + 4), gather(R, r + 5),
+        gather(R, r + 6), gather(R, r + 7), gather(R, r + 8), gather(t, s), gather(t, s + 1), gather(t, s + 2),
+    )  # fmt: skip
 
-    (a, b, 1) / q is the point in the camera frame, r the residual to the pixel (u, v), p the derivative of the pixel by
-    (a, b). So the derivative by the pose is p @ [[q, 0, -q a, -a b, 1 + a², -b], [0, q, -q b, -(1 + b²), a b, a]], and by
-    the point p @ q [[1, 0, -a], [0, 1, -b]] @ R. is_distorted says whether k1 to p2 count.
+
+@inlined
+def model_of(models, m):  # type: ignore[no-untyped-def]
+    """fx fy cx cy k1 k2 p1 p2 of model m of models (.., 8), each eight times."""
+    return (
+        lanes(models[m, 0]), lanes(models[m, 1]), lanes(models[m, 2]), lanes(models[m, 3]), lanes(models[m, 4]), lanes(models[m, 5]),
+        lanes(models[m, 6]), lanes(models[m, 7]),
+    )  # fmt: skip
+
+
+@inlined
+def models_of(models, c):  # type: ignore[no-untyped-def]
+    """`model_of` for `Indices` c."""
+    m = 8 * c
+    return (
+        gather(models, m), gather(models, m + 1), gather(models, m + 2), gather(models, m + 3), gather(models, m + 4),
+        gather(models, m + 5), gather(models, m + 6), gather(models, m + 7),
+    )  # fmt: skip
+
+
+@inlined
+def points_of(points, p):  # type: ignore[no-untyped-def]
+    """x, y, z of points (.., 3) for `Indices` p; pixels (.., 2) are read likewise."""
+    return gather(points, 3 * p), gather(points, 3 * p + 1), gather(points, 3 * p + 2)
+
+
+@inlined
+def in_camera(pose, X, Y, Z):  # type: ignore[no-untyped-def]
+    """A point in the frame of a camera, its pose as `pose_of` gives it."""
+    x = pose[0] * X + pose[1] * Y + pose[2] * Z + pose[9]
+    y = pose[3] * X + pose[4] * Y + pose[5] * Z + pose[10]
+    return x, y, pose[6] * X + pose[7] * Y + pose[8] * Z + pose[11]
+
+
+@inlined
+def linearize_lanes(x, y, z, is_distorted, model, u, v):  # type: ignore[no-untyped-def]
+    """The residual and its derivatives in few numbers, eight at a time: is_seen, q, a, b, r0, r1, p00, p01, p10, p11.
+
+    (a, b, 1) / q is the point in the camera frame, q = a = b = 0 behind the camera; r the residual to the pixel (u, v),
+    p the derivative of the pixel by (a, b). So the derivative by the pose is
+    p @ [[q, 0, -q a, -a b, 1 + a², -b], [0, q, -q b, -(1 + b²), a b, a]], and by the point p @ q [[1, 0, -a], [0, 1, -b]] @ R.
+    is_distorted says whether k1 to p2 of the model count.
     """
-    q = 1.0 / z if z >= MIN_DEPTH else 0.0
-    a, b = x * q, y * q
+    fx, fy, cx, cy, k1, k2, p1, p2 = model
+    is_seen = z >= MIN_DEPTH
+    q = select(is_seen, 1.0 / z, 0.0)
+    a, b = select(is_seen, x * q, 0.0), select(is_seen, y * q, 0.0)
     if not is_distorted:
-        return q, a, b, fx * a + cx - u, fy * b + cy - v, fx, 0.0, 0.0, fy
+        return is_seen, q, a, b, fx * a + cx - u, fy * b + cy - v, fx, lanes(0.0), lanes(0.0), fy
     xd, yd = distort(a, b, k1, k2, p1, p2)
     r2 = a * a + b * b
     radial, slope = 1.0 + r2 * (k1 + r2 * k2), 2.0 * k1 + 4.0 * k2 * r2
     mixed = a * b * slope + 2.0 * p1 * a + 2.0 * p2 * b
     xa, yb = radial + a * a * slope + 2.0 * p1 * b + 6.0 * p2 * a, radial + b * b * slope + 6.0 * p1 * b + 2.0 * p2 * a
-    return q, a, b, fx * xd + cx - u, fy * yd + cy - v, fx * xa, fx * mixed, fy * mixed, fy * yb
+    return is_seen, q, a, b, fx * xd + cx - u, fy * yd + cy - v, fx * xa, fx * mixed, fy * mixed, fy * yb
 
 
 @inlined
-def squared_error_normalized(x, y, z, is_distorted, fx, fy, cx, cy, k1, k2, p1, p2, u, v):  # type: ignore[no-untyped-def]
-    """|r|² of `linearize_normalized` in pixels², infinite behind the camera."""
-    if z < MIN_DEPTH:
-        return np.inf
+def squared_error_lanes(x, y, z, is_distorted, model, u, v):  # type: ignore[no-untyped-def]
+    """|r|² of `linearize_lanes` in pixels², infinite behind the camera."""
+    fx, fy, cx, cy, k1, k2, p1, p2 = model
     q = 1.0 / z
     a, b = x * q, y * q
     if is_distorted:
         a, b = distort(a, b, k1, k2, p1, p2)
     du, dv = fx * a + cx - u, fy * b + cy - v
-    return du * du + dv * dv
+    return select(z >= MIN_DEPTH, du * du + dv * dv, np.inf)
 
 
 @inlined
-def model_derivatives(models, m, a, b, J):  # type: ignore[no-untyped-def]
-    """Fills J (2, 8), the derivative of the pixel by fx fy cx cy k1 k2 p1 p2 of model m at normalised coordinates (a, b)."""
-    u, v = distort(a, b, models[m, 4], models[m, 5], models[m, 6], models[m, 7])
+def model_derivatives(a, b, model):  # type: ignore[no-untyped-def]
+    """The derivatives of the pixel at normalised coordinates (a, b): of u by fx k1 k2 p1 p2, of v by fy k1 k2 p1 p2."""
+    fx, fy, _, _, k1, k2, p1, p2 = model
+    u, v = distort(a, b, k1, k2, p1, p2)
     r2 = a * a + b * b
-    fx, fy = models[m, 0], models[m, 1]
-    J[0, 0], J[0, 1], J[0, 2], J[0, 3] = u, 0.0, 1.0, 0.0
-    J[1, 0], J[1, 1], J[1, 2], J[1, 3] = 0.0, v, 0.0, 1.0
-    J[0, 4], J[0, 5], J[0, 6], J[0, 7] = fx * a * r2, fx * a * r2 * r2, 2.0 * fx * a * b, fx * (r2 + 2.0 * a * a)
-    J[1, 4], J[1, 5], J[1, 6], J[1, 7] = fy * b * r2, fy * b * r2 * r2, fy * (r2 + 2.0 * b * b), 2.0 * fy * a * b
+    r4, ab = r2 * r2, 2.0 * a * b
+    return (
+        u, fx * a * r2, fx * a * r4, fx * ab, fx * (r2 + 2.0 * a * a),
+        v, fy * b * r2, fy * b * r4, fy * (r2 + 2.0 * b * b), fy * ab,
+    )  # fmt: skip
 
 
 @kernel
 def fill_model_derivatives(models, rays, J):  # type: ignore[no-untyped-def]
     """J (N, 2, 8) by the model (1, 8) of the pixels of rays (N, 3) with z = 1."""
     for i in range(rays.shape[0]):
-        model_derivatives(models, 0, rays[i, 0], rays[i, 1], J[i])
+        d = model_derivatives(rays[i, 0], rays[i, 1], (
+            models[0, 0], models[0, 1], models[0, 2], models[0, 3], models[0, 4], models[0, 5], models[0, 6], models[0, 7],
+        ))  # fmt: skip
+        J[i] = 0.0
+        J[i, 0, 0], J[i, 0, 2], J[i, 0, 4], J[i, 0, 5], J[i, 0, 6], J[i, 0, 7] = d[0], 1.0, d[1], d[2], d[3], d[4]
+        J[i, 1, 1], J[i, 1, 3], J[i, 1, 4], J[i, 1, 5], J[i, 1, 6], J[i, 1, 7] = d[5], 1.0, d[6], d[7], d[8], d[9]
 
 
 @inlined

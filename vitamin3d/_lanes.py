@@ -1,0 +1,248 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Eight numbers at a time, for kernels: LLVM does not vectorise sums whose order it must keep, nor gathers from many arrays.
+
+Inside a kernel `Lanes` are eight float64 and calculate like one number, with numbers too; `Indices` are eight int64, `Masks` eight
+truths. Each operation is one of LLVM's on a vector of eight, which becomes one or several instructions of whatever processor there is.
+A product and the sum it goes into may be fused, as the processor can; NaN and infinities are what they are. Arrays that are
+read and written must be C-contiguous and are addressed as flat ones; nothing checks bounds.
+"""
+
+import operator
+from collections.abc import Callable
+from typing import Any
+
+from llvmlite import ir
+from numba.core import cgutils, types
+from numba.core.typing.templates import ConcreteTemplate, infer_global, signature
+from numba.extending import intrinsic, lower_builtin, models, register_model
+
+WIDTH = 8
+_BOOL, _INT32, _INT64, _DOUBLE = ir.IntType(1), ir.IntType(32), ir.IntType(64), ir.DoubleType()
+
+
+class LanesType(types.Type):  # type: ignore[misc,unused-ignore]
+    """Eight numbers of one kind, as numba knows them."""
+
+    def __init__(self, name: str, element: Any) -> None:
+        super().__init__(name=name)
+        self.vector = ir.VectorType(element, WIDTH)
+
+
+class _VectorModel(models.PrimitiveModel):  # type: ignore[misc,unused-ignore]
+    def __init__(self, manager: Any, numba_type: LanesType) -> None:
+        super().__init__(manager, numba_type, numba_type.vector)
+
+
+register_model(LanesType)(_VectorModel)
+Lanes, Indices, Masks = LanesType("Lanes", _DOUBLE), LanesType("Indices", _INT64), LanesType("Masks", _BOOL)
+_SCALARS = {Lanes: types.float64, Indices: types.int64, Masks: types.boolean}
+
+
+def _vector(builder: Any, kind: LanesType, numba_type: Any, value: Any) -> Any:
+    """A vector as it is, a number eight times."""
+    if isinstance(numba_type, LanesType):
+        return value
+    if kind is Masks:
+        value = builder.trunc(value, _BOOL)
+    first = builder.insert_element(ir.Constant(kind.vector, ir.Undefined), value, _INT32(0))
+    return builder.shuffle_vector(first, ir.Constant(kind.vector, ir.Undefined), ir.Constant(ir.VectorType(_INT32, WIDTH), [0] * WIDTH))
+
+
+def _operation(function: Any, kind: LanesType, result: LanesType, build: Callable[[Any, Any, Any], Any]) -> None:
+    """Lets kernels apply a binary operator to vectors of a kind, and to one and a number."""
+    pairs = ((kind, kind), (kind, _SCALARS[kind]), (_SCALARS[kind], kind))
+    infer_global(function)(type("Cases", (ConcreteTemplate,), {"cases": [signature(result, *pair) for pair in pairs]}))
+
+    def lower(context: Any, builder: Any, sig: Any, arguments: Any) -> Any:
+        return build(builder, *(_vector(builder, kind, t, x) for t, x in zip(sig.args, arguments, strict=True)))
+
+    for pair in pairs:
+        lower_builtin(function, *pair)(lower)
+
+
+for _functions, _of_lanes, _of_indices in (
+    ((operator.add, operator.iadd), "fadd", "add"),
+    ((operator.sub, operator.isub), "fsub", "sub"),
+    ((operator.mul, operator.imul), "fmul", "mul"),
+    ((operator.truediv,), "fdiv", ""),
+):
+    for _function in _functions:
+        _operation(_function, Lanes, Lanes, lambda builder, a, b, name=_of_lanes: getattr(builder, name)(a, b, flags=("contract",)))
+        if _of_indices:
+            _operation(_function, Indices, Indices, lambda builder, a, b, name=_of_indices: getattr(builder, name)(a, b))
+for _function, _sign in ((operator.lt, "<"), (operator.le, "<="), (operator.gt, ">"), (operator.ge, ">=")):
+    _operation(_function, Lanes, Masks, lambda builder, a, b, sign=_sign: builder.fcmp_ordered(sign, a, b))
+    _operation(_function, Indices, Masks, lambda builder, a, b, sign=_sign: builder.icmp_signed(sign, a, b))
+_operation(operator.and_, Masks, Masks, lambda builder, a, b: builder.and_(a, b))
+_operation(operator.xor, Masks, Masks, lambda builder, a, b: builder.xor(a, b))
+infer_global(operator.neg)(type("Cases", (ConcreteTemplate,), {"cases": [signature(Lanes, Lanes)]}))
+
+
+@lower_builtin(operator.neg, Lanes)  # type: ignore[untyped-decorator,unused-ignore]
+def _negative(context: Any, builder: Any, sig: Any, arguments: Any) -> Any:
+    return builder.fneg(arguments[0])
+
+
+def _kind_of(*numba_types: Any) -> LanesType:
+    return next((t for t in numba_types if isinstance(t, LanesType)), Lanes)
+
+
+def _element(numba_type: Any) -> LanesType:
+    """What eight of an array's elements are."""
+    return Lanes if isinstance(numba_type.dtype, types.Float) else Indices
+
+
+@intrinsic  # type: ignore[untyped-decorator,unused-ignore]
+def lanes(typing, number):  # type: ignore[no-untyped-def]
+    """The number eight times; lanes as they are."""
+    return Lanes(number), lambda context, builder, sig, arguments: _vector(builder, Lanes, sig.args[0], arguments[0])
+
+
+@intrinsic  # type: ignore[untyped-decorator,unused-ignore]
+def counting(typing, first):  # type: ignore[no-untyped-def]
+    """Indices first, first + 1, ..."""
+
+    def build(context, builder, sig, arguments):  # type: ignore[no-untyped-def]
+        return builder.add(_vector(builder, Indices, types.int64, arguments[0]), ir.Constant(Indices.vector, list(range(WIDTH))))
+
+    return Indices(types.int64), build
+
+
+@intrinsic  # type: ignore[untyped-decorator,unused-ignore]
+def select(typing, condition, a, b):  # type: ignore[no-untyped-def]
+    """Lane by lane a where the condition holds, else b; both are calculated."""
+    kind = Indices if Indices in (a, b) or (isinstance(a, types.Integer) and isinstance(b, types.Integer)) else Lanes
+    a, b = (t if isinstance(t, LanesType) else _SCALARS[kind] for t in (a, b))
+
+    def build(context, builder, sig, arguments):  # type: ignore[no-untyped-def]
+        chosen = (_vector(builder, kind, t, x) for t, x in zip(sig.args[1:], arguments[1:], strict=True))
+        return builder.select(arguments[0], *chosen)
+
+    return kind(Masks, a, b), build
+
+
+@intrinsic  # type: ignore[untyped-decorator,unused-ignore]
+def square_root(typing, x):  # type: ignore[no-untyped-def]
+    """Of each lane; NaN of a negative one."""
+
+    def build(context, builder, sig, arguments):  # type: ignore[no-untyped-def]
+        function_type = ir.FunctionType(Lanes.vector, [Lanes.vector])
+        function = cgutils.get_or_insert_function(builder.module, function_type, f"llvm.sqrt.v{WIDTH}f64")
+        return builder.call(function, arguments)
+
+    return Lanes(Lanes), build
+
+
+@intrinsic  # type: ignore[untyped-decorator,unused-ignore]
+def total(typing, x):  # type: ignore[no-untyped-def]
+    """The sum of the lanes, always in the same order."""
+
+    def build(context, builder, sig, arguments):  # type: ignore[no-untyped-def]
+        parts = [builder.extract_element(arguments[0], _INT32(k)) for k in range(WIDTH)]
+        while len(parts) > 1:
+            parts = [builder.fadd(a, b) for a, b in zip(parts[::2], parts[1::2], strict=True)]
+        return parts[0]
+
+    return types.float64(Lanes), build
+
+
+@intrinsic  # type: ignore[untyped-decorator,unused-ignore]
+def greatest(typing, x):  # type: ignore[no-untyped-def]
+    """The largest of the lanes."""
+
+    def build(context, builder, sig, arguments):  # type: ignore[no-untyped-def]
+        out = builder.extract_element(arguments[0], _INT32(0))
+        for k in range(1, WIDTH):
+            other = builder.extract_element(arguments[0], _INT32(k))
+            out = builder.select(builder.fcmp_ordered(">", other, out), other, out)
+        return out
+
+    return types.float64(Lanes), build
+
+
+@intrinsic  # type: ignore[untyped-decorator,unused-ignore]
+def any_of(typing, condition):  # type: ignore[no-untyped-def]
+    """Whether it holds in some lane."""
+
+    def build(context, builder, sig, arguments):  # type: ignore[no-untyped-def]
+        bits = builder.bitcast(arguments[0], ir.IntType(WIDTH))
+        return builder.icmp_unsigned("!=", bits, ir.IntType(WIDTH)(0))
+
+    return types.boolean(Masks), build
+
+
+@intrinsic  # type: ignore[untyped-decorator,unused-ignore]
+def transposed(typing, rows):  # type: ignore[no-untyped-def]
+    """Of eight lanes the first numbers of all, the second numbers, and so on."""
+
+    def build(context, builder, sig, arguments):  # type: ignore[no-untyped-def]
+        rows = [builder.extract_value(arguments[0], k) for k in range(WIDTH)]
+        for step in (1, 2, 4):
+            lows = [k if not k & step else WIDTH + k - step for k in range(WIDTH)]
+            low, high = (ir.Constant(ir.VectorType(_INT32, WIDTH), picks) for picks in (lows, [k + step for k in lows]))
+            for i in range(WIDTH):
+                if not i & step:
+                    a, b = rows[i], rows[i + step]
+                    rows[i], rows[i + step] = builder.shuffle_vector(a, b, low), builder.shuffle_vector(a, b, high)
+        return context.make_tuple(builder, sig.return_type, rows)
+
+    eight = types.UniTuple(Lanes, WIDTH)
+    return eight(eight), build
+
+
+def _address(context: Any, builder: Any, array_type: Any, array: Any, index: Any) -> Any:
+    return builder.gep(context.make_array(array_type)(context, builder, array).data, [index])
+
+
+@intrinsic  # type: ignore[untyped-decorator,unused-ignore]
+def load(typing, array, first):  # type: ignore[no-untyped-def]
+    """Eight neighbouring numbers of an array."""
+
+    def build(context, builder, sig, arguments):  # type: ignore[no-untyped-def]
+        pointer = _address(context, builder, sig.args[0], *arguments)
+        return builder.load(builder.bitcast(pointer, Lanes.vector.as_pointer()), align=8)
+
+    return Lanes(array, types.int64), build
+
+
+@intrinsic  # type: ignore[untyped-decorator,unused-ignore]
+def store(typing, array, first, x):  # type: ignore[no-untyped-def]
+    """Writes eight neighbouring numbers into an array."""
+
+    def build(context, builder, sig, arguments):  # type: ignore[no-untyped-def]
+        pointer = _address(context, builder, sig.args[0], *arguments[:2])
+        builder.store(arguments[2], builder.bitcast(pointer, Lanes.vector.as_pointer()), align=8)
+        return context.get_dummy_value()
+
+    return types.void(array, types.int64, Lanes), build
+
+
+@intrinsic  # type: ignore[untyped-decorator,unused-ignore]
+def gather(typing, array, indices):  # type: ignore[no-untyped-def]
+    """array[index] of each lane; of integers these are `Indices` again."""
+    kind = _element(array)
+
+    def build(context, builder, sig, arguments):  # type: ignore[no-untyped-def]
+        out = ir.Constant(kind.vector, ir.Undefined)
+        for k in range(WIDTH):
+            index = builder.extract_element(arguments[1], _INT32(k))
+            value = builder.load(_address(context, builder, sig.args[0], arguments[0], index))
+            if kind is Indices and value.type != _INT64:
+                value = builder.sext(value, _INT64)
+            out = builder.insert_element(out, value, _INT32(k))
+        return out
+
+    return kind(array, Indices), build
+
+
+@intrinsic  # type: ignore[untyped-decorator,unused-ignore]
+def scatter(typing, array, indices, x):  # type: ignore[no-untyped-def]
+    """array[index] = x, lane after lane."""
+
+    def build(context, builder, sig, arguments):  # type: ignore[no-untyped-def]
+        for k in range(WIDTH):
+            index, value = (builder.extract_element(a, _INT32(k)) for a in arguments[1:])
+            builder.store(value, _address(context, builder, sig.args[0], arguments[0], index))
+        return context.get_dummy_value()
+
+    return types.void(array, Indices, Lanes), build
