@@ -9,9 +9,10 @@ read and written must be C-contiguous and are addressed as flat ones; nothing ch
 
 import operator
 from collections.abc import Callable
+from functools import partial
 from typing import Any
 
-from llvmlite import ir
+from llvmlite import ir  # type: ignore[import-untyped,unused-ignore]
 from numba.core import cgutils, types
 from numba.core.typing.templates import ConcreteTemplate, infer_global, signature
 from numba.extending import intrinsic, lower_builtin, models, register_model
@@ -48,7 +49,7 @@ def _vector(builder: Any, kind: LanesType, numba_type: Any, value: Any) -> Any:
     return builder.shuffle_vector(first, ir.Constant(kind.vector, ir.Undefined), ir.Constant(ir.VectorType(_INT32, WIDTH), [0] * WIDTH))
 
 
-def _operation(function: Any, kind: LanesType, result: LanesType, build: Callable[[Any, Any, Any], Any]) -> None:
+def _operation(function: Any, kind: LanesType, result: LanesType, build: Callable[..., Any]) -> None:
     """Lets kernels apply a binary operator to vectors of a kind, and to one and a number."""
     pairs = ((kind, kind), (kind, _SCALARS[kind]), (_SCALARS[kind], kind))
     infer_global(function)(type("Cases", (ConcreteTemplate,), {"cases": [signature(result, *pair) for pair in pairs]}))
@@ -60,19 +61,26 @@ def _operation(function: Any, kind: LanesType, result: LanesType, build: Callabl
         lower_builtin(function, *pair)(lower)
 
 
-for _functions, _of_lanes, _of_indices in (
-    ((operator.add, operator.iadd), "fadd", "add"),
-    ((operator.sub, operator.isub), "fsub", "sub"),
-    ((operator.mul, operator.imul), "fmul", "mul"),
-    ((operator.truediv,), "fdiv", ""),
+def _arithmetic(builder: Any, a: Any, b: Any, instruction: str) -> Any:
+    return getattr(builder, instruction)(a, b, **({"flags": ("contract",)} if instruction.startswith("f") else {}))
+
+
+def _compared(builder: Any, a: Any, b: Any, sign: str) -> Any:
+    return builder.fcmp_ordered(sign, a, b) if a.type.element == _DOUBLE else builder.icmp_signed(sign, a, b)
+
+
+for _functions, _instructions in (
+    ((operator.add, operator.iadd), ("fadd", "add")),
+    ((operator.sub, operator.isub), ("fsub", "sub")),
+    ((operator.mul, operator.imul), ("fmul", "mul")),
+    ((operator.truediv,), ("fdiv",)),
 ):
     for _function in _functions:
-        _operation(_function, Lanes, Lanes, lambda builder, a, b, name=_of_lanes: getattr(builder, name)(a, b, flags=("contract",)))
-        if _of_indices:
-            _operation(_function, Indices, Indices, lambda builder, a, b, name=_of_indices: getattr(builder, name)(a, b))
+        for _kind, _instruction in zip((Lanes, Indices), _instructions, strict=False):
+            _operation(_function, _kind, _kind, partial(_arithmetic, instruction=_instruction))
 for _function, _sign in ((operator.lt, "<"), (operator.le, "<="), (operator.gt, ">"), (operator.ge, ">=")):
-    _operation(_function, Lanes, Masks, lambda builder, a, b, sign=_sign: builder.fcmp_ordered(sign, a, b))
-    _operation(_function, Indices, Masks, lambda builder, a, b, sign=_sign: builder.icmp_signed(sign, a, b))
+    for _kind in (Lanes, Indices):
+        _operation(_function, _kind, Masks, partial(_compared, sign=_sign))
 _operation(operator.and_, Masks, Masks, lambda builder, a, b: builder.and_(a, b))
 _operation(operator.xor, Masks, Masks, lambda builder, a, b: builder.xor(a, b))
 infer_global(operator.neg)(type("Cases", (ConcreteTemplate,), {"cases": [signature(Lanes, Lanes)]}))
@@ -186,7 +194,7 @@ def transposed(typing, rows):  # type: ignore[no-untyped-def]
                     rows[i], rows[i + step] = builder.shuffle_vector(a, b, low), builder.shuffle_vector(a, b, high)
         return context.make_tuple(builder, sig.return_type, rows)
 
-    eight = types.UniTuple(Lanes, WIDTH)
+    eight = types.UniTuple(Lanes, WIDTH)  # type: ignore[attr-defined,unused-ignore]
     return eight(eight), build
 
 

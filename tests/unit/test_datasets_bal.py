@@ -7,7 +7,7 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from vitamin3d.bundle_adjustment.adjust import AdjustmentSettings, adjust
-from vitamin3d.bundle_adjustment.variables import squared_errors_of
+from vitamin3d.bundle_adjustment.variables import Variables, squared_errors_of
 from vitamin3d.datasets.bal import read_bal
 from vitamin3d.errors import InputError
 
@@ -37,7 +37,7 @@ def test_our_residual_is_that_of_bal(problem, tmp_path):
     for name, data in (("p.txt", text.encode()), ("p.txt.bz2", bz2.compress(text.encode()))):
         (tmp_path / name).write_bytes(data)
         read, models = read_bal(tmp_path / name)
-        errors = squared_errors_of(read, models)
+        errors = squared_errors_of(read, Variables.of(read, models))
         expected = [np.square(bal_residual(cameras[c], points[p], [x, y])).sum() for c, p, x, y in np.array(rows, object)[read.obs_rows]]
         np.testing.assert_allclose(errors, expected, rtol=1e-9)
         np.testing.assert_array_equal(read.points_world, points)

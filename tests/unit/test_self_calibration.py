@@ -6,11 +6,11 @@ import pytest
 from scenes import EUROC, PINHOLE, arc_scene, orbit, perturbed, problem_of, project
 
 from vitamin3d._jit import kernel
-from vitamin3d.bundle_adjustment.normal_equations import linearize_observation, observation_error
+from vitamin3d._lanes import lanes, total
 from vitamin3d.bundle_adjustment.problem import points_of_long_tracks, select_points
 from vitamin3d.bundle_adjustment.self_calibration import adjust_with_intrinsics, parameter_basis
 from vitamin3d.errors import InputError
-from vitamin3d.geometry.reprojection import fill_model_derivatives
+from vitamin3d.geometry.reprojection import fill_model_derivatives, in_camera, linearize_lanes, model_of, pose_of, squared_error_lanes
 from vitamin3d.geometry.se3 import exp_se3
 
 SIGMA = 2.0
@@ -19,21 +19,21 @@ LENS = EUROC.with_model([460.0, 455.0, 367.0, 248.0, -0.25, 0.06, 1e-3, -5e-4])
 
 @kernel
 def run_linearize(models, is_distorted, R, t, points, pixels):
-    return linearize_observation(R, t, 0, models, 0, is_distorted, points, 0, pixels, 0)
-
-
-@kernel
-def run_squared_error(models, is_distorted, R, t, points, pixels):
-    return observation_error(R, t, 0, models, 0, is_distorted, points, 0, pixels, 0)
+    """Eight times the same, added up: q a b r0 r1 p00 p01 p10 p11, and |r|²."""
+    x, y, z = in_camera(pose_of(R, t, 0), lanes(points[0, 0]), lanes(points[0, 1]), lanes(points[0, 2]))
+    u, v, model = lanes(pixels[0, 0]), lanes(pixels[0, 1]), model_of(models, 0)
+    _, q, a, b, r0, r1, p00, p01, p10, p11 = linearize_lanes(x, y, z, is_distorted, model, u, v)
+    e = squared_error_lanes(x, y, z, is_distorted, model, u, v)
+    return total(q), total(a), total(b), total(r0), total(r1), total(p00), total(p01), total(p10), total(p11), total(e)
 
 
 def linearized(model, T, X, pixel):
     """r (2,), J_pose (2, 6), J_point (2, 3), J_model (2, 8) as the solvers put them together."""
     R, t = np.ascontiguousarray(T[:3, :3]), np.ascontiguousarray(T[:3, 3])
     scene = model[None], bool(model[4:].any()), R[None], t[None], X[None], pixel[None]
-    q, a, b, r0, r1, *p = run_linearize(*scene)
+    q, a, b, r0, r1, *p, e = np.array(run_linearize(*scene)) / 8
     p, J_model = np.array(p).reshape(2, 2), np.empty((1, 2, 8))
-    assert run_squared_error(*scene) == pytest.approx(r0 * r0 + r1 * r1, rel=1e-12)
+    assert e == pytest.approx(r0 * r0 + r1 * r1, rel=1e-12)
     fill_model_derivatives(model[None], np.array([[a, b, 1.0]]), J_model)
     J_pose = p @ [[q, 0, -q * a, -a * b, 1 + a * a, -b], [0, q, -q * b, -(1 + b * b), a * b, a]]
     return np.array([r0, r1]), J_pose, J_pose[:, :3] @ R, J_model[0]
@@ -67,8 +67,8 @@ def test_residual_and_jacobians_equal_finite_differences(model, rng):
 
 def test_behind_the_camera_there_is_no_residual():
     scene = LENS.model[None], True, np.eye(3)[None], np.zeros((1, 3)), np.array([[0.1, 0.2, -1.0]]), np.zeros((1, 2))
-    assert run_linearize(*scene)[0] == 0.0
-    assert np.isinf(run_squared_error(*scene))
+    q, *_, e = run_linearize(*scene)
+    assert q == 0.0 and np.isinf(e)
 
 
 def seen_through(true, wrong, rng, noise_px=0.3, num_points=250, outlier_share=0.02):

@@ -69,12 +69,14 @@ class NormalEquations(NamedTuple):
         F, D, K = num_free, width, num_shared
         N = F * D + K
         shapes = ((N, N), (N,), (N,), (F, D, D), (F, 6, K), (K, K), (num_points, 3), (num_points, 6))
-        return NormalEquations(*(np.zeros(shape) for shape in shapes), aligned_zeros(N + 1, F * _padded(D) + _padded(K)))
+        arrays = [*map(np.zeros, shapes), aligned_zeros(N + 1, F * _padded(D) + _padded(K))]
+        return NormalEquations(*arrays)
 
     def clear(self) -> None:
         """Zeros again, all but what is overwritten or cleared when it is read."""
         for array in (self.gradient, self.H_cameras, self.H_border, self.H_shared):
             array.fill(0.0)
+
 
 # --- blocks ------------------------------------------------------------------------------------------------------
 
@@ -309,16 +311,16 @@ class _Scratch(NamedTuple):
     """(8 (n + 1), 3 padded D): of each point and observation the three rows of Lᵀ H_pc, and last those of the shared parameters;
     zeros behind D."""
     blocks: Array
-    """(n + 1, 3): of the observations by free cameras which row of `columns`, and first row and column of `sums`."""
+    """(n + 1, 4): of the observations by free cameras where they begin in `columns`, first row and column in `sums`, and how wide
+    they are, zeros included."""
 
 
 def _scratch(sightings: Sightings, width: int, K: int) -> _Scratch:
-    starts, by_length = sightings.starts, sightings.by_length
-    n = int(starts[by_length[0] + 1] - starts[by_length[0]]) if len(by_length) else 0
+    n = sightings.longest
     W = np.empty((n + 1 if width > 6 else 1, 3, K, WIDTH))
     columns = aligned_zeros(WIDTH * (n + 1), 3 * max(_padded(width), _padded(K)))
     terms, Jk, z = (np.empty((*shape, WIDTH)) for shape in ((n + 1, 9), (2, K), (3,)))
-    return _Scratch(terms, Jk, W, z, columns, np.empty((n + 1, 3), np.int64))
+    return _Scratch(terms, Jk, W, z, columns, np.empty((n + 1, 4), np.int64))
 
 
 @inlined
@@ -379,39 +381,50 @@ def _add_point_model(Jk, K, J, p00, p01, p10, p11, w00, w01, w11, W, n):  # type
 
 
 @inlined
-def _subtract_products(columns, blocks, num, wide, wide_shared, width, num_shared, z, sums):  # type: ignore[no-untyped-def]
-    """sums -= Vᵀ [V z], upper triangle of blocks, V the `num` blocks of a point, the last one of shared parameters if there are any.
+def _subtract_six_rows(columns, size, blocks, i, num, sums, stride):  # type: ignore[no-untyped-def]
+    """The first six rows of block i of `_subtract_products`: there is no time for loops, and six rows share what is read."""
+    first, to = blocks[i, 0], stride * blocks[i, 1]
+    V = columns.reshape(-1)
+    u0, u1, u2, u3, u4, u5 = V[first], V[first + 1], V[first + 2], V[first + 3], V[first + 4], V[first + 5]
+    first += size
+    v0, v1, v2, v3, v4, v5 = V[first], V[first + 1], V[first + 2], V[first + 3], V[first + 4], V[first + 5]
+    first += size
+    w0, w1, w2, w3, w4, w5 = V[first], V[first + 1], V[first + 2], V[first + 3], V[first + 4], V[first + 5]
+    for j in range(i, num):
+        for n in range(0, blocks[j, 3], WIDTH):
+            at, k = blocks[j, 0] + n, to + blocks[j, 2] + n
+            x, y, z = load(columns, at), load(columns, at + size), load(columns, at + 2 * size)
+            store(sums, k, load(sums, k) - u0 * x - v0 * y - w0 * z)
+            store(sums, k + stride, load(sums, k + stride) - u1 * x - v1 * y - w1 * z)
+            store(sums, k + 2 * stride, load(sums, k + 2 * stride) - u2 * x - v2 * y - w2 * z)
+            store(sums, k + 3 * stride, load(sums, k + 3 * stride) - u3 * x - v3 * y - w3 * z)
+            store(sums, k + 4 * stride, load(sums, k + 4 * stride) - u4 * x - v4 * y - w4 * z)
+            store(sums, k + 5 * stride, load(sums, k + 5 * stride) - u5 * x - v5 * y - w5 * z)
 
-    The rows of `columns` that make V are in `blocks`; a block is `wide` columns wide, filled up with zeros, the last `wide_shared`.
-    """
-    stride, N = sums.shape[1], sums.shape[0] - 1
-    size = columns.shape[1] // 3
+
+@inlined
+def _subtract_row(columns, size, blocks, i, num, u, v, w, sums, to):  # type: ignore[no-untyped-def]
+    """One row of `_subtract_products` from block i on: `to` is where it begins, u v w what it has in the three rows of `columns`."""
+    for j in range(i, num):
+        for n in range(0, blocks[j, 3], WIDTH):
+            at, k = blocks[j, 0] + n, to + blocks[j, 2] + n
+            x, y, z = load(columns, at), load(columns, at + size), load(columns, at + 2 * size)
+            store(sums, k, load(sums, k) - u * x - v * y - w * z)
+
+
+@inlined
+def _subtract_products(columns, blocks, num, width, num_shared, z, sums):  # type: ignore[no-untyped-def]
+    """sums -= Vᵀ [V z], upper triangle of blocks, V the `num` blocks of a point, the last one of shared parameters if there are any."""
+    stride, size, V = sums.shape[1], columns.shape[1] // 3, columns.reshape(-1)
     for i in range(num):
-        is_shared = num_shared > 0 and i == num - 1
-        V, row, rows = columns[blocks[i, 0]], blocks[i, 1], num_shared if is_shared else width
-        for m in range(0, rows - rows % 3, 3):
-            u0, v0, w0 = V[m], V[size + m], V[2 * size + m]
-            u1, v1, w1 = V[m + 1], V[size + m + 1], V[2 * size + m + 1]
-            u2, v2, w2 = V[m + 2], V[size + m + 2], V[2 * size + m + 2]
-            for j in range(i, num):
-                at, to = 3 * size * blocks[j, 0], stride * (row + m) + blocks[j, 2]
-                for n in range(0, wide_shared if num_shared > 0 and j == num - 1 else wide, WIDTH):
-                    x, y, w = load(columns, at + n), load(columns, at + size + n), load(columns, at + 2 * size + n)
-                    d0, d1, d2 = load(sums, to + n), load(sums, to + stride + n), load(sums, to + 2 * stride + n)
-                    store(sums, to + n, d0 - u0 * x - v0 * y - w0 * w)
-                    store(sums, to + stride + n, d1 - u1 * x - v1 * y - w1 * w)
-                    store(sums, to + 2 * stride + n, d2 - u2 * x - v2 * y - w2 * w)
-        for m in range(rows - rows % 3, rows):
-            for j in range(i, num):
-                at, to = 3 * size * blocks[j, 0], stride * (row + m) + blocks[j, 2]
-                for n in range(0, wide_shared if num_shared > 0 and j == num - 1 else wide, WIDTH):
-                    x, y, w = load(columns, at + n), load(columns, at + size + n), load(columns, at + 2 * size + n)
-                    store(sums, to + n, load(sums, to + n) - V[m] * x - V[size + m] * y - V[2 * size + m] * w)
-    for j in range(num):
-        at, to = 3 * size * blocks[j, 0], stride * N + blocks[j, 2]
-        for n in range(0, wide_shared if num_shared > 0 and j == num - 1 else wide, WIDTH):
-            x, y, w = load(columns, at + n), load(columns, at + size + n), load(columns, at + 2 * size + n)
-            store(sums, to + n, load(sums, to + n) - z[0] * x - z[1] * y - z[2] * w)
+        rows = num_shared if num_shared > 0 and i == num - 1 else width
+        six = 6 if rows >= 6 else 0
+        if six:
+            _subtract_six_rows(columns, size, blocks, i, num, sums, stride)
+        for m in range(six, rows):
+            at, to = blocks[i, 0] + m, stride * (blocks[i, 1] + m)
+            _subtract_row(columns, size, blocks, i, num, V[at], V[at + size], V[at + 2 * size], sums, to)
+    _subtract_row(columns, size, blocks, 0, num, z[0], z[1], z[2], sums, stride * (sums.shape[0] - 1))
 
 
 @inlined
@@ -419,16 +432,17 @@ def _eliminate(cameras, slot, first_row, num_shared, z, equations, scratch):  # 
     """Subtracts what a point that `cameras` see knows from `sums`; its rows of `columns` begin at first_row."""
     F, D = equations.H_cameras.shape[0], equations.H_cameras.shape[1]
     wide, wide_shared = -(-D // WIDTH) * WIDTH, -(-num_shared // WIDTH) * WIDTH
-    blocks, num, longest = scratch.blocks, 0, scratch.terms.shape[0] - 1
+    blocks, num, last_row = scratch.blocks, 0, first_row + scratch.terms.shape[0] - 1
+    row_size = scratch.columns.shape[1]
     for n in range(cameras.shape[0]):
         f = slot[cameras[n]]
         if f >= 0:
-            blocks[num, 0], blocks[num, 1], blocks[num, 2] = first_row + n, D * f, wide * f
+            blocks[num, 0], blocks[num, 1], blocks[num, 2], blocks[num, 3] = row_size * (first_row + n), D * f, wide * f, wide
             num += 1
     if num_shared > 0:
-        blocks[num, 0], blocks[num, 1], blocks[num, 2] = first_row + longest, D * F, wide * F
+        blocks[num, 0], blocks[num, 1], blocks[num, 2], blocks[num, 3] = row_size * last_row, D * F, wide * F, wide_shared
         num += 1
-    _subtract_products(scratch.columns, blocks, num, wide, wide_shared, D, num_shared, z, equations.sums)
+    _subtract_products(scratch.columns, blocks, num, D, num_shared, z, equations.sums)
 
 
 @kernel

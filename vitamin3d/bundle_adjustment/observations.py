@@ -34,6 +34,10 @@ class Views(NamedTuple):
     """(C, 8) fx fy cx cy k1 k2 p1 p2 of each camera, or (1, 8) of all."""
 
 
+STRETCH = 256
+"""Points within it are sorted by length; it is short, as points that were made together are seen by the same cameras."""
+
+
 class Sightings(NamedTuple):
     """The observations, sorted by point and again by camera, for the kernels."""
 
@@ -44,7 +48,9 @@ class Sightings(NamedTuple):
     pixels: Array
     """(M, 2)."""
     by_length: Array
-    """(P,) int64: the points, most observations first; those that are treated together have about as many."""
+    """(P,) int64: the points; stretches of them sorted by the number of observations, so that eight neighbours have about as many."""
+    longest: int
+    """The largest number of observations."""
     camera_starts: Array
     """(C + 1,) int64: of each camera, in the other order."""
     camera_point: Array
@@ -55,19 +61,23 @@ class Sightings(NamedTuple):
 
 @kernel
 def longest_first(starts, order):  # type: ignore[no-untyped-def]
-    """Fills order (P,): points by descending number of observations, a counting sort."""
+    """Fills order (P,): stretches of points, each by descending number of observations (a counting sort); returns the largest number."""
     P, longest = starts.shape[0] - 1, 0
     for p in range(P):
         longest = max(longest, starts[p + 1] - starts[p])
-    cursor = np.zeros(longest + 2, np.int64)
-    for p in range(P):
-        cursor[longest - (starts[p + 1] - starts[p]) + 1] += 1
-    for n in range(longest):
-        cursor[n + 1] += cursor[n]
-    for p in range(P):
-        n = longest - (starts[p + 1] - starts[p])
-        order[cursor[n]] = p
-        cursor[n] += 1
+    cursor = np.empty(longest + 2, np.int64)
+    for first in range(0, P, STRETCH):
+        last = min(P, first + STRETCH)
+        cursor[:] = 0
+        for p in range(first, last):
+            cursor[longest - (starts[p + 1] - starts[p]) + 1] += 1
+        for n in range(longest):
+            cursor[n + 1] += cursor[n]
+        for p in range(first, last):
+            n = longest - (starts[p + 1] - starts[p])
+            order[first + cursor[n]] = p
+            cursor[n] += 1
+    return longest
 
 
 @inlined

@@ -113,9 +113,7 @@ def sweep_cameras(views, sightings, points, inverse_squared_sigma, scratch):  # 
         for i in range(first, last, WIDTH):
             is_there, seen = linearize_rows(sightings, points, pose, model, is_distorted, i, last)
             is_seen, q, a, b, r0, r1, p00, p01, p10, p11 = seen
-            rho, _, g00, g01, g11, h0, h1, _, _, _ = information(
-                is_there, is_seen, r0, r1, p00, p01, p10, p11, inverse_squared_sigma, 0.0
-            )
+            rho, _, g00, g01, g11, h0, h1, _, _, _ = information(is_there, is_seen, r0, r1, p00, p01, p10, p11, inverse_squared_sigma, 0.0)
             costs = costs + rho
             block = add_camera(block, q, a, b, g00, g01, g11, h0, h1)
         before = total(costs)
@@ -150,15 +148,13 @@ def sweep_points(views, sightings, points, inverse_squared_sigma):  # type: igno
     for start in range(0, points.shape[0], WIDTH):
         p, is_new, first, count, longest = point_group(sightings, start)
         if longest == 0:
-            break
+            continue
         X, Y, Z = points_of(points, p)
         block, before = no_point(), lanes(0.0)
         for n in range(longest):
             is_there, _, pose, _, seen = linearize_sighting(views, sightings, is_distorted, X, Y, Z, first, count, n)
             is_seen, q, a, b, r0, r1, p00, p01, p10, p11 = seen
-            rho, _, g00, g01, g11, h0, h1, _, _, _ = information(
-                is_there, is_seen, r0, r1, p00, p01, p10, p11, inverse_squared_sigma, 0.0
-            )
+            rho, _, g00, g01, g11, h0, h1, _, _, _ = information(is_there, is_seen, r0, r1, p00, p01, p10, p11, inverse_squared_sigma, 0.0)
             before = before + rho
             J = by_point(pose, q, a, b)
             block = add_point(block, J, weighted(J, g00, g01, g11), h0, h1)

@@ -54,9 +54,9 @@ def sightings_of(problem: BundleProblem, pixels: Array | None = None) -> Sightin
     """The observations in both orders; with other `pixels` (M, 2), in the problem's order, where they are given."""
     pixels, order = np.ascontiguousarray(problem.obs_pixels if pixels is None else pixels), problem.point_order
     by_length = np.empty(len(problem.points_world), np.int64)
-    longest_first(problem.point_starts, by_length)
+    longest = longest_first(problem.point_starts, by_length)
     by_point = problem.point_starts, problem.obs_camera[order], pixels[order], by_length
-    return Sightings(*by_point, _camera_starts(problem), np.ascontiguousarray(problem.obs_point), pixels)
+    return Sightings(*by_point, longest, _camera_starts(problem), np.ascontiguousarray(problem.obs_point), pixels)
 
 
 def pinhole_model(camera: Camera) -> Array:
