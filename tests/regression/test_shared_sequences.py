@@ -5,6 +5,7 @@ import json
 import subprocess
 import sys
 from pathlib import Path
+from typing import Any
 
 import pytest
 
@@ -52,3 +53,30 @@ def test_a_drone_that_stands_still_makes_no_map(tmp_path: Path) -> None:
     stats = json.loads((tmp_path / "stats.json").read_text())
     assert stats["tracked_frames"] == 0 and stats["keyframes"] == 0
     assert not (tmp_path / "mesh_high.ply").exists()
+
+
+def evaluate(trajectory: Path, sequence: str) -> dict[str, Any]:
+    command = [sys.executable, "-m", "vitamin3d.cli", "evaluate", str(trajectory), "-g", str(SHARED / "data" / sequence), "--json"]
+    done = subprocess.run(command, capture_output=True, text=True, cwd=ROOT, check=False)
+    assert done.returncode == 0, done.stderr
+    found: dict[str, Any] = json.loads(done.stdout)
+    return found
+
+
+@pytest.mark.parametrize("sequence", ["kitchen", "kitti00", "room1_v101_easy", "room1_v103_difficult"])
+def test_evaluate_agrees_with_the_scorer(sequence: str) -> None:
+    """Somebody else's trajectories, by our command and by the independent script."""
+    trajectory = SHARED / "peers" / "orbslam3" / sequence / "trajectory.tum"
+    found, expected = evaluate(trajectory, sequence), score("trajectory", sequence, trajectory)
+    assert found["success_rate"] == pytest.approx(expected["success_rate"], rel=1e-3)
+    for name, statistic in (("rmse", "ate_rmse_cm"), ("median", "ate_median_cm"), ("maximum", "ate_max_cm")):
+        assert 100 * found["ate"]["Sim(3)"][name] == pytest.approx(expected[statistic], rel=1e-3)
+    assert found["scale"] == pytest.approx(expected["scale"], rel=1e-3)
+
+
+def test_the_truth_of_euroc_is_recognised_as_the_bodys() -> None:
+    """V1_01's left-camera trajectory against the sequence's own truth, which is of the body."""
+    found = evaluate(SHARED / "data" / "euroc_groundtruth" / "V101.tum", "euroc_v101_start")
+    assert found["truth"]["frame"] == "body" and found["truth"]["frame_is_certain"]
+    assert 0.03 < found["truth"]["uncorrected_rmse"] < 0.06 and found["truth"]["uncorrected_rotation_deg"] > 30
+    assert found["alignment"] == "no alignment" and found["ate"]["no alignment"]["rmse"] < 0.05

@@ -186,10 +186,12 @@ def test_mistakes_are_one_line(run, other, command, tmp_path):
     assert not (run / "comparison").exists()
 
 
-def test_a_stray_point_is_said_and_left_out(run, other, command):
+def test_a_stray_point_is_an_error_unless_it_may_be_left_out(run, other, command):
     with (other / "MapPoints.txt").open("a") as file:
         file.write("20000 0 0\n")
-    told = command("compare", run, other)
+    error = command("compare", run, other).error
+    assert "MapPoints.txt: 1 points" in error and "--drop-strays" in error and not (run / "comparison").exists()
+    told = command("compare", run, other, "--drop-strays")
     assert told.code == 0 and told.err.startswith("warning: ") and "MapPoints.txt: 1 points" in told.err
     assert items_of(run / "comparison")[1]["orbslam3/demo"]["strays"] == 1
 

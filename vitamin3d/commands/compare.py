@@ -30,6 +30,7 @@ def compare(
     back: Annotated[float, typer.Option(help="The viewer steps back by so many median depths.")] = 0.3,
     up: Annotated[float, typer.Option(help="And up.")] = 0.2,
     right: Annotated[float, typer.Option(help="And to the right.")] = 0.0,
+    drop_strays: Annotated[bool, typer.Option("--drop-strays", help="Leave out points that are NaN or far from all others.")] = False,
     out: Annotated[Path | None, typer.Option("--out", "-o", help="Folder for JSON, table and picture; default: RUN/comparison.")] = None,
     json: Annotated[bool, typer.Option("--json", help="Print JSON instead of the table.")] = False,
 ) -> None:
@@ -50,7 +51,7 @@ def compare(
     surface = _reference(reference, source or ground_truth, dataset, truth)
     for item in (*own, *items):
         if item.geometry.strays:
-            typer.echo(f"warning: {item.path}: {item.geometry.strays} points are not finite or far from all others; left out", err=True)
+            _say_strays(item.path, item.geometry.strays, drop_strays)
     report, placed = compared(own, items, truth, surface)
     is_metric = truth is not None or bool(finished.stats["scale"]["known"])
     report = {"run": str(run), "unit": "metre" if is_metric else "map unit", "ours": own[-1].name, **report}
@@ -64,6 +65,16 @@ def compare(
     for name, data in made.items():
         write_file(folder / name, [data])
     typer.echo(made["comparison.json"].decode() if json else text + "\n" + "\n".join(f"  {folder / name}" for name in made), nl=not json)
+
+
+def _say_strays(path: Path, count: int, are_dropped: bool) -> None:
+    """A warning where they may be left out, else an error: one point at 2 km spoils every figure."""
+    from vitamin3d.errors import InputError
+
+    what = f"{path}: {count} points are not finite or far from all others"
+    if not are_dropped:
+        raise InputError(f"{what}; clean the cloud, or leave them out with --drop-strays")
+    typer.echo(f"warning: {what}; left out", err=True)
 
 
 def _reference(path: Path | None, folder: Path | None, dataset: "Dataset | None", truth: "Truth | None") -> "Array | None":
