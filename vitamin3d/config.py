@@ -96,7 +96,7 @@ class InitializationConfig:
     """Sec. 5.1: when two frames become the first map."""
 
     min_motion_px: float = 25.0
-    min_parallax_deg: float = 1.0
+    min_parallax_deg: float = 0.6
     """Median over the triangulated points."""
     ransac_threshold_px: float = 1.0
     min_tracks: int = 100
@@ -243,6 +243,13 @@ class CalibrationConfig:
     first_keyframes: int = 20
     growth: float = 1.5
     """The next refinement is due when the map has grown by this factor; one more comes at the end."""
+    readout: bool = True
+    """The readout time of a rolling shutter is looked for as well."""
+    readout_points: int = 150
+    """Landmarks per keyframe that take part in that."""
+    readout_systematic_factor: float = 5.0
+    max_readout_deviation: float = 0.3
+    """In intervals between two frames, systematic errors included; above it the motion does not determine the readout time."""
     points_per_keyframe: int = 400
     """Landmarks with the most observations that take part, about so many in each keyframe."""
     sigma_px: float = 1.0

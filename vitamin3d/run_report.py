@@ -24,6 +24,7 @@ from vitamin3d.exporters.line_plot import Axes, Line, line_plot
 from vitamin3d.exporters.mesh import read_ply
 from vitamin3d.exporters.rendering import jpeg
 from vitamin3d.exporters.report import Picture, Report, evaluation_section, report_html, with_evaluation
+from vitamin3d.geometry.rolling_shutter import measured_pixels
 from vitamin3d.runtime import RunRecord
 from vitamin3d.slam import Slam
 from vitamin3d.timestamps import seconds_from_nanoseconds
@@ -141,7 +142,8 @@ def _tracked_extrema(dataset: Dataset, slam: Slam, keyframe: int) -> Picture | N
     if isinstance(frame, Unreadable):
         return None
     rows = slam.map.observations_of(keyframe)
-    pixels, is_landmark = slam.camera.distort(slam.map.obs_pixels[rows]), slam.map.is_mapped(slam.map.obs_landmark[rows])
+    pixels = measured_pixels(slam.map.obs_pixels[rows], slam.map.image_motions[keyframe], slam.camera)
+    is_landmark = slam.map.is_mapped(slam.map.obs_landmark[rows])
     picture = np.repeat(frame.image[..., None], 3, axis=2) if frame.color is None else frame.color
     scale = PICTURE_WIDTH / picture.shape[1]
     drawn = cv2.resize(picture, None, fx=scale, fy=scale, interpolation=cv2.INTER_AREA if scale < 1 else cv2.INTER_CUBIC)

@@ -70,7 +70,8 @@ def calibration_table(camera: Camera, refinement: CalibrationRefinement) -> dict
 
 
 def _camera_table(camera: Camera) -> dict[str, float]:
-    return dict(zip(("fx", "fy", "cx", "cy", "k1", "k2", "p1", "p2"), camera.model.tolist(), strict=True))
+    names = ("fx", "fy", "cx", "cy", "k1", "k2", "p1", "p2", "readout_s")
+    return dict(zip(names, [*camera.model.tolist(), camera.readout_s], strict=True))
 
 
 LATE_MS = 50.0

@@ -12,6 +12,7 @@ from vitamin3d.bundle_adjustment.subspace import adjust_subspace
 from vitamin3d.bundle_adjustment.variables import squared_reprojection_errors
 from vitamin3d.config import Config
 from vitamin3d.geometry.camera import Camera
+from vitamin3d.geometry.rolling_shutter import NO_MOTION, at_one_moment, fit_image_motion, ideal_pixels
 from vitamin3d.geometry.se3 import inverse
 from vitamin3d.mapping.calibration_refinement import CalibrationRefinement
 from vitamin3d.mapping.initialization_history import InitializationHistory, TrackedView
@@ -23,6 +24,7 @@ from vitamin3d.mapping.map_condensation import condense, is_due
 from vitamin3d.mapping.map_initialization import add_view, build_first_map
 from vitamin3d.mapping.p3p_localization import localize
 from vitamin3d.mapping.pose_log import PoseLog
+from vitamin3d.mapping.readout_estimation import set_image_motion
 from vitamin3d.mapping.relocalization import relocalize
 from vitamin3d.mapping.sparse_map import SparseMap
 from vitamin3d.mapping.two_view_initialization import initialize_from_two_views
@@ -55,6 +57,7 @@ class Slam:
         self._history = InitializationHistory(config.initialization)
         self._pending_frames: dict[int, Frame] = {}
         self._meetings: list[Array] = []
+        self._image_motion, self._last_ns = NO_MOTION, 0
         self._next_id = 0
         self._unique_ids, self._num_condensed, self._num_forgotten = np.zeros(0, np.int64), 0, 0
         self._frame_count = 0
@@ -89,7 +92,16 @@ class Slam:
             predicted = predict_by_dense_flow(self.tracks.pixels, front.dense_flow, self.config.extrema_tracking.flow_reduction)
         else:
             predicted = predict_by_dominant_flow(self.tracks.pixels, front.dominant_flow)
+        if self.camera.readout_s or self.calibration.wants_image_motion:
+            self._follow_image_motion(front.frame.timestamp_ns, predicted)
         return track_extrema(self.tracks, predicted, front.kappa, self.config.extrema_tracking)
+
+    def _follow_image_motion(self, timestamp_ns: int, predicted: Array) -> None:
+        """How fast the image moves, for the rolling shutter; a keyframe just taken gets the mean of before and after."""
+        motion = fit_image_motion(self.tracks.pixels, predicted, 1e-9 * (timestamp_ns - self._last_ns), self.camera)
+        if self.map.num_keyframes and self.map.timestamps_ns[-1] == self._last_ns:
+            set_image_motion(self.map, self.map.num_keyframes - 1, 0.5 * (self._image_motion + motion), self.camera)
+        self._image_motion, self._last_ns = motion, timestamp_ns
 
     def _refill_when_due(self, front: FrontEndFrame) -> None:
         """Every few frames, free extrema become tracks."""
@@ -107,7 +119,7 @@ class Slam:
     def _seen(self) -> tuple[Tracks, Array]:
         """The tracks that do not coast, and their ideal pixels."""
         seen = self.tracks.select(self.tracks.missed == 0)
-        pixels = self.camera.undistort(seen.pixels)
+        pixels = ideal_pixels(seen.pixels, self._image_motion, self.camera)
         valid = np.isfinite(pixels[:, 0])
         return seen.select(valid), pixels[valid]
 
@@ -115,7 +127,7 @@ class Slam:
 
     def _initialize(self, front: FrontEndFrame) -> None:
         """The first map from two frames; the frames before it are localised against it."""
-        self._history.append(TrackedView(front.frame, *self._seen()))
+        self._history.append(TrackedView(front.frame, *self._seen(), self._image_motion))
         ids, pixels_0, pixels_1 = self._history.pair()
         if not self._history.is_worth_a_try(pixels_0, pixels_1):
             return
@@ -200,9 +212,9 @@ class Slam:
     def _recover(self, front: FrontEndFrame, T_cam_world: Array, gate_px: float | None = None) -> int:
         """Takes up landmarks that came back into view; how many."""
         before = self.tracks.ids
-        image, recovery = front.frame.image, self.config.recovery
+        image, recovery, motion = front.frame.image, self.config.recovery, self._image_motion
         recovery = recovery if gate_px is None else replace(recovery, gate_px=gate_px)
-        self.tracks, meetings = recover_landmarks(self.tracks, self.map, image, front.kappa, T_cam_world, self.camera, recovery)
+        self.tracks, meetings = recover_landmarks(self.tracks, self.map, image, front.kappa, motion, T_cam_world, self.camera, recovery)
         self._meetings.append(meetings)
         return int((~np.isin(self.tracks.ids, before)).sum())
 
@@ -243,7 +255,7 @@ class Slam:
         return is_keyframe(self.map.obs_pixels[rows][mapped[a]], pixels[b], len(mapped), gap, self.config.keyframes)
 
     def _add_keyframe(self, front: FrontEndFrame, T_cam_world: Array) -> int:
-        keyframe = add_view(self.map, TrackedView(front.frame, *self._seen()), T_cam_world)
+        keyframe = add_view(self.map, TrackedView(front.frame, *self._seen(), self._image_motion), T_cam_world)
         self._pending_frames[keyframe] = front.frame
         self._pending_frames.pop(keyframe - UNTAKEN_WINDOWS * self.config.window.keyframes, None)
         return keyframe
@@ -360,9 +372,10 @@ class Slam:
         return [(k, self._pending_frames.pop(k)) for k in ready]
 
     def snapshot(self, keyframe: int, frame: Frame) -> MapSnapshot:
-        """A keyframe with the depths of its landmarks as the map has them now."""
+        """A keyframe with the depths of its landmarks as the map has them now; its picture as if read at one moment."""
         vertices = keyframe_vertices(self.map, keyframe, self.camera, self.config.snapshot)
-        return MapSnapshot(frame, self.map.clone_pose(keyframe), *vertices)
+        motion = self.map.image_motions[keyframe]
+        return MapSnapshot(at_one_moment(frame, motion, self.camera), self.map.clone_pose(keyframe), *vertices)
 
     def trajectory(self) -> Trajectory:
         """Camera-to-world poses of all localised frames."""

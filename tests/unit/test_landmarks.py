@@ -10,6 +10,7 @@ from scenes import PINHOLE, arc_scene, map_of, texture, warped, with_noise
 
 from vitamin3d.config import CloudConfig, CurvatureConfig, ExtremaConfig, RecoveryConfig, SnapshotConfig, TriangulationConfig
 from vitamin3d.geometry.camera import Camera
+from vitamin3d.geometry.rolling_shutter import NO_MOTION
 from vitamin3d.geometry.se3 import exp_se3, inverse
 from vitamin3d.mapping.landmark_recovery import _climb_strict, cut_patches, patch_similarity, recover_landmarks, same_landmarks
 from vitamin3d.mapping.landmark_statistics import (
@@ -117,7 +118,7 @@ def wall():
 
 def recovered(wall, tracks=None, T=MOVED, config=CONFIG, camera=CAMERA):
     sparse_map, _, image, kappa = wall
-    return recover_landmarks(Tracks.empty() if tracks is None else tracks, sparse_map, image, kappa, T, camera, config)[0]
+    return recover_landmarks(Tracks.empty() if tracks is None else tracks, sparse_map, image, kappa, NO_MOTION, T, camera, config)[0]
 
 
 def some_tracks(ids, pixels):
@@ -177,7 +178,7 @@ def test_landmarks_that_meet_are_one_where_they_are_near_in_space(wall):
     impostors = recovered(wall).ids[-4:]
     sparse_map.points_world[impostors] = sparse_map.points_world[ids] * np.array([1.0, 1.001, 1.001, 1.2])[:, None]
     live = some_tracks(impostors, pixels[ids] + SHIFT)
-    tracks, meetings = recover_landmarks(live, sparse_map, image, kappa, MOVED, CAMERA, CONFIG)
+    tracks, meetings = recover_landmarks(live, sparse_map, image, kappa, NO_MOTION, MOVED, CAMERA, CONFIG)
     assert sorted(meetings.tolist()) == sorted([a, b] for a, b in zip(ids.tolist(), impostors.tolist(), strict=True))
     assert not np.isin(ids, tracks.ids).any()
     same = same_landmarks(np.concatenate([meetings, meetings]), tracks, sparse_map, MOVED, 0.02)

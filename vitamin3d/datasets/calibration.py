@@ -37,7 +37,7 @@ def read_calibration(path: Path) -> Calibration:
     fx, fy, cx, cy = _numbers(path, fields, "intrinsics", 4)
     width, height = _resolution(path, fields)
     k1, k2, p1, p2 = _numbers(path, fields, "distortion_coefficients", 4)
-    camera = Camera(fx, fy, cx, cy, width, height, (k1, k2, p1, p2))
+    camera = Camera(fx, fy, cx, cy, width, height, (k1, k2, p1, p2), _readout(path, fields))
     check_camera(path, camera)
     return Calibration(camera, _rate(path, fields), _extrinsics(path, fields))
 
@@ -136,6 +136,19 @@ def _rate(path: Path, fields: dict[str, Any]) -> Fraction | None:
     if not 0 < rate <= 10**6:
         raise InputError(f"{path}: `rate_hz` must be a positive number, found {fields['rate_hz']!r}")
     return rate
+
+
+def _readout(path: Path, fields: dict[str, Any]) -> float:
+    """Seconds from the first to the last row of a rolling shutter, negative where the last is read first; 0 where the file has none."""
+    if fields.get("readout_s") is None:
+        return 0.0
+    try:
+        seconds = float(fields["readout_s"])
+    except (TypeError, ValueError):
+        seconds = float("nan")
+    if not abs(seconds) < 1.0:
+        raise InputError(f"{path}: `readout_s` must be the seconds from the first to the last row, found {fields['readout_s']!r}")
+    return seconds
 
 
 def _extrinsics(path: Path, fields: dict[str, Any]) -> Array | None:

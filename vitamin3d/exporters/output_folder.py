@@ -45,7 +45,7 @@ def _camera_yaml(camera: Camera) -> str:
     return (
         f"camera_model: pinhole\nintrinsics: [{camera.fx!r}, {camera.fy!r}, {camera.cx!r}, {camera.cy!r}]\n"
         f"distortion_model: radial-tangential\ndistortion_coefficients: {list(camera.distortion)!r}\n"
-        f"resolution: [{camera.width}, {camera.height}]\n"
+        f"resolution: [{camera.width}, {camera.height}]\n{f'readout_s: {camera.readout_s!r}' + chr(10) if camera.readout_s else ''}"
     )
 
 

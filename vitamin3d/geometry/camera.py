@@ -71,6 +71,8 @@ class Camera:
     height: int
     distortion: tuple[float, float, float, float] = (0.0, 0.0, 0.0, 0.0)
     """k1, k2, p1, p2."""
+    readout_s: float = 0.0
+    """Seconds from the first to the last row of a rolling shutter (`geometry/rolling_shutter.py`); 0: all at once."""
 
     @property
     def K(self) -> Array:

@@ -15,6 +15,8 @@ from vitamin3d.bundle_adjustment.self_calibration import CalibrationReport, adju
 from vitamin3d.bundle_adjustment.subspace import adjust_subspace
 from vitamin3d.config import CalibrationConfig
 from vitamin3d.geometry.camera import Camera
+from vitamin3d.geometry.rolling_shutter import ideal_pixels, measured_pixels
+from vitamin3d.mapping.readout_estimation import estimate_readout, frame_interval_s
 from vitamin3d.mapping.sparse_map import SparseMap
 from vitamin3d.mapping.window_selection import build_problem, store_solution, whole_map
 
@@ -50,6 +52,11 @@ class CalibrationRefinement:
     def is_enabled(self) -> bool:
         return self.config.refine != "off"
 
+    @property
+    def wants_image_motion(self) -> bool:
+        """Whether keyframes need the image's motion, from which the readout time comes."""
+        return self.is_enabled and self.config.readout
+
     def is_due(self, num_keyframes: int) -> bool:
         """Whether the map has grown enough since the last refinement."""
         return self.is_enabled and num_keyframes >= max(self.config.first_keyframes, self._next)
@@ -57,6 +64,10 @@ class CalibrationRefinement:
     def refine(self, sparse_map: SparseMap, camera: Camera) -> Camera:
         """The camera refined with the whole map, which moves along: poses, points and ideal pixels; or the same camera."""
         self._next = int(np.ceil(self.config.growth * sparse_map.num_keyframes))
+        camera = self._refine_intrinsics(sparse_map, camera)
+        return self._refine_readout(sparse_map, camera) if self.wants_image_motion and sparse_map.image_motions.any() else camera
+
+    def _refine_intrinsics(self, sparse_map: SparseMap, camera: Camera) -> Camera:
         problem = build_problem(sparse_map, whole_map(sparse_map))
         chosen = points_of_long_tracks(problem, self.config.points_per_keyframe)
         free = tuple(self.config.parameters.split())
@@ -69,7 +80,24 @@ class CalibrationRefinement:
         self.history.append(Refinement(sparse_map.num_keyframes, refined if not reason else camera, deviations, not reason, reason))
         if reason:
             return camera
-        _store(sparse_map, solved, camera, refined, self.config)
+        _change_camera(sparse_map, camera, refined, self.config, solved)
+        return refined
+
+    def _refine_readout(self, sparse_map: SparseMap, camera: Camera) -> Camera:
+        found, interval = estimate_readout(sparse_map, camera, self.config), frame_interval_s(sparse_map)
+        deviation = self.config.readout_systematic_factor * found.deviation_s
+        refined, reason = dataclasses.replace(camera, readout_s=float(np.clip(found.readout_s, -interval, interval))), ""
+        if not deviation <= self.config.max_readout_deviation * interval:
+            reason = "the motion does not determine the readout time"
+        elif abs(found.readout_s) > interval + deviation:
+            reason = f"a readout of {1e3 * found.readout_s:.1f} ms is longer than the time between two frames"
+        elif camera.readout_s == 0.0 and abs(found.readout_s) < self.config.significance * deviation:
+            reason = "all rows were read at once"
+        believed = camera if reason else refined
+        self.history.append(Refinement(sparse_map.num_keyframes, believed, {"readout_s": deviation}, not reason, reason))
+        if reason:
+            return camera
+        _change_camera(sparse_map, camera, refined, self.config)
         return refined
 
     def _doubt(self, deviations: dict[str, float], refined: Camera, report: CalibrationReport) -> str:
@@ -88,7 +116,7 @@ class CalibrationRefinement:
         return ""
 
     def _was_refined(self) -> bool:
-        return any(refinement.accepted for refinement in self.history)
+        return any(refinement.accepted and "readout_s" not in refinement.deviations for refinement in self.history)
 
     def _distance(self, report: CalibrationReport, refined: Camera) -> float:
         """From the given calibration, all parameters together, in standard deviations (Mahalanobis)."""
@@ -97,12 +125,15 @@ class CalibrationRefinement:
         return float(np.sqrt(moved @ np.linalg.solve(report.covariance, moved))) / self.config.systematic_factor
 
 
-def _store(sparse_map: SparseMap, chosen: BundleProblem, old: Camera, new: Camera, config: CalibrationConfig) -> None:
-    """Writes the chosen points' solution into the map, and moves the other points to it."""
-    sparse_map.obs_pixels[:] = new.undistort(old.distort(sparse_map.obs_pixels))
+def _change_camera(sparse_map: SparseMap, old: Camera, new: Camera, config: CalibrationConfig, chosen: BundleProblem | None = None) -> None:
+    """Turns the map's ideal pixels into those of another camera, writes the `chosen` points' solution, and moves the points to it."""
+    for k, motion in enumerate(sparse_map.image_motions):
+        rows = sparse_map.observations_of(k)
+        sparse_map.obs_pixels[rows] = ideal_pixels(measured_pixels(sparse_map.obs_pixels[rows], motion, old), motion, new)
     sparse_map.remove_observations(np.flatnonzero(np.isnan(sparse_map.obs_pixels[:, 0])))
     window = whole_map(sparse_map)
-    store_solution(sparse_map, window, chosen)
+    if chosen is not None:
+        store_solution(sparse_map, window, chosen)
     problem = build_problem(sparse_map, window)
     problem = dataclasses.replace(problem, camera_is_free=np.zeros(len(problem.T_cam_world), np.bool_))
     for sigma in POINT_SIGMAS:

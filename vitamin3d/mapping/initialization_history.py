@@ -19,6 +19,8 @@ class TrackedView:
     """Without those that coast."""
     ideal_pixels: Array
     """(N, 2) of the tracks."""
+    image_motion: Array
+    """(6, 2) of `geometry/rolling_shutter.py`."""
 
 
 def shared_tracks(a: TrackedView, b: TrackedView) -> tuple[Array, Array]:

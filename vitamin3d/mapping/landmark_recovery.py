@@ -6,6 +6,7 @@ import numpy as np
 from vitamin3d._jit import kernel
 from vitamin3d.config import RecoveryConfig
 from vitamin3d.geometry.camera import Camera
+from vitamin3d.geometry.rolling_shutter import measured_pixels
 from vitamin3d.geometry.se3 import inverse
 from vitamin3d.mapping.sparse_map import PATCH_PX, SparseMap
 from vitamin3d.tracking.extrema import subpixel_offset
@@ -91,8 +92,9 @@ def _visible_candidates(sparse_map: SparseMap, live_ids: Array, T_cam_world: Arr
 
 
 def recover_landmarks(
-    tracks: Tracks, sparse_map: SparseMap, image: Array, kappa: Array, T_cam_world: Array, camera: Camera, config: RecoveryConfig
-) -> tuple[Tracks, Array]:
+    tracks: Tracks, sparse_map: SparseMap, image: Array, kappa: Array, image_motion: Array, T_cam_world: Array, camera: Camera,
+    config: RecoveryConfig,
+) -> tuple[Tracks, Array]:  # fmt: skip
     """The tracks with those landmarks added that came back into view, and the ids (N, 2) of landmarks that met tracked ones there.
 
     A landmark is taken up where its projection climbs to a maximum of kappa within the gate and the patch of its last
@@ -101,11 +103,13 @@ def recover_landmarks(
     Args:
         image: (H, W) uint8 picture of the frame.
         kappa: (H, W) float32 of the frame.
+        image_motion: (6, 2) of the frame.
         T_cam_world: (4, 4) of the frame.
     """
     ids = _visible_candidates(sparse_map, tracks.ids, T_cam_world, camera, config)
     points = sparse_map.points_world[ids]
-    predicted = camera.distort(camera.ideal_from_points(points @ T_cam_world[:3, :3].T + T_cam_world[:3, 3]))
+    ideal = camera.ideal_from_points(points @ T_cam_world[:3, :3].T + T_cam_world[:3, 3])
+    predicted = measured_pixels(ideal, image_motion, camera)
     inside = camera.is_inside(predicted, BORDER_PX)
     ids, predicted = ids[inside], np.ascontiguousarray(predicted[inside])
     pixels, found = np.empty_like(predicted), np.empty(len(predicted), np.bool_)

@@ -64,7 +64,8 @@ def add_view(sparse_map: SparseMap, view: TrackedView, T_cam_world: Array) -> in
     """Adds a tracked view as a keyframe; its index."""
     colors, patches = sample_colors(view.frame, view.tracks.pixels), cut_patches(view.frame.image, view.tracks.pixels)
     frame = view.frame
-    return sparse_map.add_keyframe(frame.index, frame.timestamp_ns, T_cam_world, view.tracks.ids, view.ideal_pixels, colors, patches)
+    ids, pixels = view.tracks.ids, view.ideal_pixels
+    return sparse_map.add_keyframe(frame.index, frame.timestamp_ns, T_cam_world, ids, pixels, colors, patches, view.image_motion)
 
 
 def _add_between(sparse_map: SparseMap, view: TrackedView, last: TrackedView, camera: Camera, config: Config) -> list[TrackedView]:

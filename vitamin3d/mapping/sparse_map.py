@@ -9,6 +9,7 @@ observations count from that moment.
 import numpy as np
 
 from vitamin3d._jit import kernel
+from vitamin3d.geometry.rolling_shutter import NO_MOTION
 from vitamin3d.types import Array
 
 PATCH_PX = 9
@@ -78,6 +79,7 @@ class SparseMap:
         self.timestamps_ns: list[int] = []
         self.keyframe_starts: list[int] = [0]
         self._poses = GrowingArray((4, 4), np.float64, 0.0)
+        self._motions = GrowingArray(NO_MOTION.shape, np.float64, 0.0)
         self._obs_landmark = GrowingArray((), np.int64, -1)
         self._obs_pixels = GrowingArray((2,), np.float64, np.nan)
         self._obs_valid = GrowingArray((), np.bool_, False)
@@ -96,6 +98,11 @@ class SparseMap:
     def T_cam_world(self) -> Array:
         """(K, 4, 4) poses of the keyframes; a view."""
         return self._poses.view
+
+    @property
+    def image_motions(self) -> Array:
+        """(K, 6, 2) how the image moved when the keyframes were taken (`geometry/rolling_shutter.py`); a view."""
+        return self._motions.view
 
     @property
     def points_world(self) -> Array:
@@ -163,8 +170,9 @@ class SparseMap:
         return out
 
     def add_keyframe(
-        self, frame_index: int, timestamp_ns: int, T_cam_world: Array, ids: Array, pixels: Array, colors: Array, patches: Array
-    ) -> int:
+        self, frame_index: int, timestamp_ns: int, T_cam_world: Array, ids: Array, pixels: Array, colors: Array, patches: Array,
+        image_motion: Array = NO_MOTION,
+    ) -> int:  # fmt: skip
         """Adds a keyframe with the observations of all its tracks, landmarks or not.
 
         Args:
@@ -173,6 +181,7 @@ class SparseMap:
             pixels: (N, 2) ideal pixels.
             colors: (N, 3) uint8.
             patches: (N, 81) uint8.
+            image_motion: (6, 2).
 
         Returns:
             The index of the keyframe.
@@ -181,6 +190,7 @@ class SparseMap:
         self.frame_indices.append(frame_index)
         self.timestamps_ns.append(timestamp_ns)
         self._poses.append(T_cam_world[None])
+        self._motions.append(image_motion[None])
         self._obs_landmark.append(ids)
         self._obs_pixels.append(pixels)
         self._obs_valid.append(np.ones(len(ids), np.bool_))

@@ -22,7 +22,7 @@ class InitializationAttempt:
     reason: str
     """Empty on success; else a phrase for the user."""
     is_retry: bool = False
-    """The motion was enough to try, and the try failed."""
+    """There was motion and parallax enough for a map, and none came of it; to wait for parallax is no retry."""
 
 
 def median_motion(pixels_0: Array, pixels_1: Array) -> float:
@@ -44,19 +44,20 @@ def initialize_from_two_views(pixels_0: Array, pixels_1: Array, camera: Camera, 
     view = relative_pose(pixels_0, pixels_1, camera, config.ransac_threshold_px)
     if view is None:
         return InitializationAttempt(None, "no essential matrix explains the motion", True)
-    reason = _objection(view, config)
-    return InitializationAttempt(None if reason else view, reason, bool(reason))
+    return _judged(view, config)
 
 
-def _objection(view: TwoView, config: InitializationConfig) -> str:
-    """Why the two views must not become a map; empty if they may."""
+def _judged(view: TwoView, config: InitializationConfig) -> InitializationAttempt:
+    """The attempt with the two views, if they may become a map; else why not."""
     inlier_ratio = float(view.is_inlier.mean())
     good = np.isfinite(view.points_0[:, 0])
     if inlier_ratio < config.min_inlier_ratio:
-        return f"the motion is not that of a rigid scene: only {100 * inlier_ratio:.0f} % of the tracks agree"
+        reason = f"the motion is not that of a rigid scene: only {100 * inlier_ratio:.0f} % of the tracks agree"
+        return InitializationAttempt(None, reason, True)
     parallax = float(np.median(view.parallax_deg[view.is_inlier]))
     if parallax < config.min_parallax_deg:
-        return f"no parallax: {parallax:.2f}° in the median, the camera turns but does not travel"
+        return InitializationAttempt(None, f"no parallax: {parallax:.2f}° in the median, the camera turns but does not travel")
     if good.sum() < max(config.min_tracks, config.min_triangulated_ratio * view.is_inlier.sum()):
-        return f"only {int(good.sum())} of {int(view.is_inlier.sum())} tracks lie in front of both cameras"
-    return ""
+        reason = f"only {int(good.sum())} of {int(view.is_inlier.sum())} tracks lie in front of both cameras"
+        return InitializationAttempt(None, reason, True)
+    return InitializationAttempt(view, "")
