@@ -24,7 +24,7 @@ def some_map(rng, keyframes=12, ids=60):
         pose = np.eye(4)
         pose[:3, 3] = rng.normal(size=3)
         colors, patches = rng.integers(0, 255, (len(seen), 3)), rng.integers(0, 255, (len(seen), 81))
-        made.add_keyframe(10 * k, 1000 * k, pose, seen, rng.normal(size=(len(seen), 2)), colors, patches)
+        made.add_keyframe(10 * k, 1000 * k, pose, seen, rng.normal(size=(len(seen), 2)), colors, patches, rng.normal(size=(6, 2)))
     landmarks = rng.choice(ids, ids // 2, replace=False)
     made.points_world[landmarks] = rng.normal(size=(len(landmarks), 3))
     made.remove_observations(rng.choice(len(made.obs_landmark), 40, replace=False))
@@ -50,6 +50,7 @@ def test_what_stays_is_what_it_was(rng):
     assert set(needed) <= set(kept) and (np.diff(kept) > 0).all() and len(new.points_world) == (kept < 60).sum()
     assert new.frame_indices == [10 * k for k in keyframes] and new.timestamps_ns == [1000 * k for k in keyframes]
     np.testing.assert_array_equal(new.T_cam_world, old.T_cam_world[keyframes])
+    np.testing.assert_array_equal(new.image_motions, old.image_motions[keyframes])
     seen_again = 0
     for id_ in range(60):
         pixels = [counting(old, k, id_) for k in keyframes]

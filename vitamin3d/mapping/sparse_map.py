@@ -280,6 +280,7 @@ class SparseMap:
         copy.frame_indices = [self.frame_indices[k] for k in keyframes]
         copy.timestamps_ns = [self.timestamps_ns[k] for k in keyframes]
         copy._poses.append(self.T_cam_world[keyframes])
+        copy._motions.append(self.image_motions[keyframes])
         copy._obs_landmark.append(new_id[self.obs_landmark[counts]])
         copy._obs_pixels.append(self.obs_pixels[counts])
         copy._obs_valid.append(np.ones(int(counts.sum()), np.bool_))
