@@ -20,7 +20,7 @@ else:
 
 CHOICES = {
     "extrema_tracking.prediction": ("dense_flow", "dominant_flow"),
-    "bundle_adjustment.keyframe_solver": ("subspace-accelerated", "schur", "subspace"),
+    "bundle_adjustment.keyframe_solver": ("subspace-accelerated", "schur", "subspace", "subspace-inner"),
     "fusion.backend": ("blocks", "scalable", "voxel_block_grid"),
     "calibration.refine": ("auto", "on", "off"),
 }
@@ -210,7 +210,7 @@ class BundleAdjustmentConfig:
     """Subspace Gauss–Newton sweeps over the window at every frame (Eq. 11–12)."""
     keyframe_solver: str = "subspace-accelerated"
     """Solver of the window at each keyframe: `subspace-accelerated` (cameras together with the points eliminated, then each
-    point alone), `schur` (the former only) or `subspace` (Eq. 11–12)."""
+    point alone), `schur` (the former only), `subspace` (Eq. 11–12) or `subspace-inner` (several sweeps with the same derivatives)."""
     keyframe_iterations: int = 6
     relative_gain: float = 1e-3
     """An adjustment ends when a step lowers the cost by less than this share."""

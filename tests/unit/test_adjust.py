@@ -178,7 +178,8 @@ def test_plain_least_squares_is_an_infinite_scale(start):
 @pytest.mark.parametrize(
     "bad",
     [
-        {"solver": "ceres"}, {"gauge": "last"}, {"solver": "subspace", "free": ("f",)}, {"free": ("f",), "own": True},
+        {"solver": "ceres"}, {"gauge": "last"}, {"solver": "subspace", "free": ("f",)},
+        {"solver": "subspace-inner", "free": ("f",)}, {"free": ("f",), "own": True},
         {"sigma_px": 0.0}, {"free": ("focal",)},
     ],
 )  # fmt: skip

@@ -9,6 +9,7 @@ from scipy.optimize import least_squares
 from scipy.sparse import lil_matrix
 from scipy.spatial.transform import Rotation
 
+from vitamin3d.bundle_adjustment import subspace
 from vitamin3d.bundle_adjustment.adjust import SOLVERS, adjust_bundle
 from vitamin3d.bundle_adjustment.observations import total_cost
 from vitamin3d.bundle_adjustment.schur import ReducedSystem, adjust_schur
@@ -25,7 +26,7 @@ from vitamin3d.geometry.se3 import inverse
 from vitamin3d.geometry.sim3_alignment import align_sim3
 
 SIGMA = 2.0
-ITERATIONS = {"schur": 30, "subspace-accelerated": 30, "subspace": 300}
+ITERATIONS = {"schur": 30, "subspace-accelerated": 30, "subspace": 300, "subspace-inner": 100}
 
 
 @pytest.fixture(scope="module")
@@ -86,7 +87,7 @@ def test_the_reported_cost_is_the_minimised_cost(solved, start):
     assert 0.4 < report.rmse_px < 0.9  # 0.5 px in each coordinate, less what the points take up
 
 
-@pytest.mark.parametrize(("name", "limit"), [("schur", 0.02), ("subspace-accelerated", 0.02), ("subspace", 0.05)])
+@pytest.mark.parametrize(("name", "limit"), [("schur", 0.02), ("subspace-accelerated", 0.02), ("subspace", 0.05), ("subspace-inner", 0.05)])
 def test_the_truth_is_found(name, limit, scene, start):
     problem, _ = SOLVERS[name](start, PINHOLE, SIGMA, ITERATIONS[name], 1e-5)
     s, R, t = align_sim3(problem.points_world, scene.points)
@@ -170,6 +171,25 @@ def test_one_subspace_sweep_equals_dense_blocks():
     assert reference.robust_cost(moved, PINHOLE.intrinsics, SIGMA) == pytest.approx(report.costs[1], rel=1e-6)
     np.testing.assert_allclose(solved.T_cam_world, poses, atol=1e-7)
     np.testing.assert_allclose(solved.points_world, points, atol=1e-6)
+
+
+@pytest.mark.parametrize("sweeps", [1, 3, 3000])
+def test_inner_sweeps_solve_the_full_equations_block_by_block(sweeps, monkeypatch):
+    """Cameras by their 6×6 blocks, then points by their 3×3 ones, with the derivatives of the start; in the end H dx = -g."""
+    problem = small(2)
+    H, g = reference.full_normal_equations(problem, PINHOLE.intrinsics, SIGMA)
+    used = np.diag(H) > 0  # not the point that is seen once
+    x, blocks = np.zeros(len(g)), [slice(k, k + 6) for k in range(0, 6, 6)] + [slice(k, k + 3) for k in range(6, len(g), 3)]
+    for _ in range(min(sweeps, 3)):
+        for block in (b for b in blocks if used[b].all()):
+            x[block] -= np.linalg.solve(H[block, block], g[block] + H[block] @ x)
+    if sweeps > 3:
+        x[used] = -np.linalg.solve(H[np.ix_(used, used)], g[used])
+    monkeypatch.setattr(subspace, "INNER_SWEEPS", sweeps)
+    solved, _ = SOLVERS["subspace-inner"](problem, PINHOLE, SIGMA, 1, 0.0)
+    size = np.abs(x).max()
+    np.testing.assert_allclose(solved.points_world - problem.points_world, x[6:].reshape(-1, 3), atol=1e-5 * size)
+    np.testing.assert_allclose(solved.T_cam_world[2], reference.exp_se3(x[:6]) @ problem.T_cam_world[2], atol=1e-5 * size)
 
 
 @pytest.mark.parametrize("name", list(SOLVERS))

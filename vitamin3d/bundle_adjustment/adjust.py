@@ -19,7 +19,7 @@ from vitamin3d.bundle_adjustment.problem import BundleProblem
 from vitamin3d.bundle_adjustment.rejection import Rejection, reject
 from vitamin3d.bundle_adjustment.schur import ReducedSystem, adjust_accelerated, adjust_schur, minimise
 from vitamin3d.bundle_adjustment.self_calibration import parameter_basis
-from vitamin3d.bundle_adjustment.subspace import adjust_subspace, sweep_until
+from vitamin3d.bundle_adjustment.subspace import adjust_by_inner_sweeps, adjust_subspace, step_until, sweep_until
 from vitamin3d.bundle_adjustment.variables import Progress, Variables, free_slots, sightings_of
 from vitamin3d.config import BundleAdjustmentConfig
 from vitamin3d.errors import InputError
@@ -28,6 +28,7 @@ from vitamin3d.types import Array, BundleReport
 
 SOLVERS: dict[str, Callable[[BundleProblem, Camera, float, int, float], tuple[BundleProblem, BundleReport]]] = {
     "subspace": adjust_subspace,
+    "subspace-inner": adjust_by_inner_sweeps,
     "subspace-accelerated": adjust_accelerated,
     "schur": adjust_schur,
 }
@@ -39,7 +40,8 @@ class AdjustmentSettings:
     """How a problem is adjusted."""
 
     solver: str = "subspace-accelerated"
-    """`subspace` (Eq. 11–12), `subspace-accelerated` (all cameras together, the points eliminated and then swept), `schur`."""
+    """`subspace` (Eq. 11–12), `subspace-inner` (several sweeps with the same derivatives), `subspace-accelerated` (all cameras
+    together, the points eliminated and then swept), `schur`."""
     sigma_px: float = 2.0
     """Scale of the robust kernel; infinite: plain least squares."""
     first_sigma_px: float = 0.0
@@ -48,7 +50,7 @@ class AdjustmentSettings:
     """In each stage."""
     relative_gain: float = 1e-6
     free: tuple[str, ...] = ()
-    """Parameters of the camera that are variables too: f (or fx fy) cx cy k1 k2 p1 p2; not with `subspace`."""
+    """Parameters of the camera that are variables too: f (or fx fy) cx cy k1 k2 p1 p2; only with the two latter."""
     own: bool = False
     """Whether each camera has these parameters for itself; else all share them."""
     gauge: str = "given"
@@ -74,7 +76,7 @@ def adjust(problem: BundleProblem, models: Array, settings: AdjustmentSettings, 
     Args:
         problem: `obs_pixels` as measured, which is distorted where the models are.
         models: (1, 8) of all cameras or (C, 8) of each: fx fy cx cy k1 k2 p1 p2.
-        prior: of cameras that were marginalised; not with `subspace`.
+        prior: of cameras that were marginalised; not with `subspace` or `subspace-inner`.
 
     Raises:
         InputError: a setting that does not exist or go with the others.
@@ -104,6 +106,8 @@ def _run(
         system.inverse_squared_sigma = 1.0 / sigma**2
         if settings.solver == "subspace":
             progress = sweep_until(problem, variables, 1.0 / sigma**2, settings.iterations, settings.relative_gain)
+        elif settings.solver == "subspace-inner":
+            variables, progress = step_until(problem, variables, 1.0 / sigma**2, settings.iterations, settings.relative_gain)
         else:
             sweeps = int(settings.solver == "subspace-accelerated")
             variables, progress = minimise(system, variables, settings.iterations, settings.relative_gain, sweeps)
@@ -124,8 +128,8 @@ def _check(settings: AdjustmentSettings, models: Array, prior: CameraPrior | Non
         raise InputError(f"no solver is called {settings.solver!r}; there are {', '.join(SOLVERS)}")
     if settings.gauge not in ("given", "first", "free"):
         raise InputError(f"no gauge is called {settings.gauge!r}; there are given, first, free")
-    if settings.solver == "subspace" and (settings.free or prior is not None):
-        raise InputError("the solver 'subspace' has blocks for cameras and points only; take 'subspace-accelerated'")
+    if settings.solver in ("subspace", "subspace-inner") and (settings.free or prior is not None):
+        raise InputError(f"the solver {settings.solver!r} has blocks for cameras and points only; take 'subspace-accelerated'")
     if settings.free and settings.own == (len(models) == 1):
         raise InputError("parameters that each camera owns need a model for each camera, shared ones a single model")
     if not settings.sigma_px > 0.0:

@@ -461,7 +461,7 @@ def _read_sums(equations, num_shared):  # type: ignore[no-untyped-def]
 
 
 @kernel
-def _accumulate_points(views, sightings, points, basis, inverse_squared_sigma, most_bend, damping, equations, scratch):  # type: ignore[no-untyped-def]
+def _accumulate_points(views, sightings, points, basis, inverse_squared_sigma, most_bend, damping, is_reduced, equations, scratch):  # type: ignore[no-untyped-def]
     slot, terms, Jk, W, columns = views.slot, scratch.terms, scratch.Jk, scratch.W, scratch.columns
     K, D = basis.shape[1], equations.H_cameras.shape[1]
     is_own, is_distorted = D > 6, models_are_distorted(views.models)
@@ -502,6 +502,8 @@ def _accumulate_points(views, sightings, points, basis, inverse_squared_sigma, m
             store(scratch.z, WIDTH * m, z[m])
         for m in range(6):
             scatter(equations.root, 6 * p + m, L[m])
+        if not is_reduced:
+            continue
         for n in range(longest):
             more = (_by_model(W, n, K, 0, L), _by_model(W, n, K, 1, L)) if is_own else (nothing, nothing)
             _pose_columns(terms, n, L, more, columns, many)
@@ -521,7 +523,7 @@ def _accumulate_points(views, sightings, points, basis, inverse_squared_sigma, m
 
 def accumulate(
     views: Views, sightings: Sightings, points: Array, basis: Array, inverse_squared_sigma: float, most_bend: float, damping: float,
-    equations: NormalEquations,
+    equations: NormalEquations, is_reduced: bool = True,
 ) -> float:  # fmt: skip
     """Fills `equations` at the present variables, H_pp damped by its diagonal; returns the cost.
 
@@ -529,13 +531,15 @@ def accumulate(
         basis: (8, K); the camera model moves by basis @ step of its K free parameters.
         inverse_squared_sigma: of the robust kernel; 0 is plain least squares.
         most_bend: see `information`.
+        is_reduced: whether the points are eliminated, `reduced` and `lifted` filled.
     """
     equations.clear()
     K = basis.shape[1]
     of_cameras = _CameraScratch(np.empty(27), np.empty((2, K, WIDTH)), np.empty((7 + K, K, WIDTH)))
     _accumulate_cameras(views, sightings, points, basis, inverse_squared_sigma, most_bend, equations, of_cameras)
     scratch = _scratch(sightings, equations.H_cameras.shape[1], K)
-    return float(_accumulate_points(views, sightings, points, basis, inverse_squared_sigma, most_bend, damping, equations, scratch))
+    by_point = basis, inverse_squared_sigma, most_bend, damping, is_reduced, equations, scratch
+    return float(_accumulate_points(views, sightings, points, *by_point))
 
 
 # --- the step ----------------------------------------------------------------------------------------------------

@@ -1,9 +1,10 @@
 # SPDX-License-Identifier: Apache-2.0
 """The subspace Gauss–Newton method (Eq. 11–12): one block at a time, 6×6 for a camera and 3×3 for a point.
 
-Everything else is held while a block is solved for, and the derivatives are taken anew for each, so that no large
-matrix is built. It lowers the cost quickly and then crawls along directions in which cameras and points move together:
-those are what the Schur complement is for.
+Everything else is held while a block is solved for, so that no large matrix is built; the derivatives are taken anew
+for each block, or H dx = -g is solved by sweeps over its blocks before the step is taken (`adjust_by_inner_sweeps`). It
+lowers the cost quickly and then crawls along directions in which cameras and points move together: those are what the
+Schur complement is for.
 """
 
 from typing import NamedTuple
@@ -13,10 +14,14 @@ import numpy as np
 from vitamin3d._jit import kernel
 from vitamin3d._lanes import WIDTH, any_of, greatest, lanes, scatter, select, total
 from vitamin3d.bundle_adjustment.normal_equations import (
+    NormalEquations,
+    accumulate,
     add_camera,
     add_point,
     by_point,
     inverse_root,
+    move_cameras,
+    move_points,
     no_camera,
     no_point,
     point_step,
@@ -24,6 +29,8 @@ from vitamin3d.bundle_adjustment.normal_equations import (
     write_camera,
 )
 from vitamin3d.bundle_adjustment.observations import (
+    Sightings,
+    camera_rows,
     cost_of_camera,
     information,
     linearize_rows,
@@ -37,11 +44,12 @@ from vitamin3d.bundle_adjustment.observations import (
 from vitamin3d.bundle_adjustment.problem import BundleProblem
 from vitamin3d.bundle_adjustment.variables import Progress, Variables, free_slots, pinhole_model, sightings_of, squared_errors_of
 from vitamin3d.geometry.camera import Camera
-from vitamin3d.geometry.reprojection import model_of, points_of, pose_of, retract
+from vitamin3d.geometry.reprojection import in_camera, linearize_lanes, model_of, points_of, pose_of, retract
 from vitamin3d.types import Array, BundleReport
 
 BLOCK_DAMPING = 1e-9
 STEP_HALVINGS = 3
+INNER_SWEEPS = 5
 MIN_OBSERVATIONS = 6
 """A camera with fewer is left where it is."""
 
@@ -138,6 +146,36 @@ def sweep_cameras(views, sightings, points, inverse_squared_sigma, scratch):  # 
 
 
 @kernel
+def solve_cameras(views, sightings, points, moved, inverse_squared_sigma, scratch, delta):  # type: ignore[no-untyped-def]
+    """Eq. 11 without taking the step: delta (F, 6) of the free cameras from `views` when the points go from `points` to `moved`.
+
+    Derivatives and weights are those of `views` and `points`.
+    """
+    R, t, slot, models = views
+    sums, H, g, step, _, _ = scratch
+    is_distorted = models_are_distorted(models)
+    for c in range(R.shape[0]):
+        first, last, f = sightings.camera_starts[c], sightings.camera_starts[c + 1], slot[c]
+        if f < 0 or last - first < MIN_OBSERVATIONS:
+            continue
+        pose, model, block = pose_of(R, t, c), model_of(models, c if models.shape[0] > 1 else 0), no_camera()
+        for i in range(first, last, WIDTH):
+            _, is_there, X, Y, Z, u, v = camera_rows(sightings.camera_point, sightings.camera_pixels, points, i, last)
+            _, _, X1, Y1, Z1, _, _ = camera_rows(sightings.camera_point, sightings.camera_pixels, moved, i, last)
+            x, y, z = in_camera(pose, X, Y, Z)
+            is_seen, q, a, b, r0, r1, p00, p01, p10, p11 = linearize_lanes(x, y, z, is_distorted, model, u, v)
+            _, _, g00, g01, g11, h0, h1, _, _, _ = information(is_there, is_seen, r0, r1, p00, p01, p10, p11, inverse_squared_sigma, 0.0)
+            J, d0, d1, d2 = by_point(pose, q, a, b), X1 - X, Y1 - Y, Z1 - Z
+            da, db = J[0] * d0 + J[1] * d1 + J[2] * d2, J[3] * d0 + J[4] * d1 + J[5] * d2
+            block = add_camera(block, q, a, b, g00, g01, g11, h0 + (g00 * da + g01 * db), h1 + (g01 * da + g11 * db))
+        write_camera(block, sums, H[0], g)
+        for k in range(6):
+            H[0, k, k] += BLOCK_DAMPING * H[0, k, k] + 1e-12
+        if solve_6x6(H, g, step):
+            delta[f] = step
+
+
+@kernel
 def sweep_points(views, sightings, points, inverse_squared_sigma):  # type: ignore[no-untyped-def]
     """Eq. 12 for each point with two observations, in place: a Gauss–Newton step, halved while the cost rises, else not taken.
 
@@ -210,3 +248,59 @@ def sweep_until(problem: BundleProblem, variables: Variables, weight: float, swe
             progress.stopped = "gain"
             break
     return progress
+
+
+def adjust_by_inner_sweeps(
+    problem: BundleProblem, camera: Camera, sigma_px: float, steps: int, relative_gain: float = 1e-5
+) -> tuple[BundleProblem, BundleReport]:
+    """Like `adjust_subspace`, with the derivatives taken once a step, whose H dx = -g is solved by sweeps over the blocks."""
+    variables, progress = step_until(problem, Variables.of(problem, pinhole_model(camera)), 1.0 / sigma_px**2, steps, relative_gain)
+    return variables.written_to(problem), progress.report(squared_errors_of(problem, variables), sigma_px)
+
+
+def step_until(problem: BundleProblem, variables: Variables, weight: float, steps: int, relative_gain: float) -> tuple[Variables, Progress]:
+    """Steps of `INNER_SWEEPS` sweeps each, until one gains less than a share of the cost; weight = 1 / sigma²."""
+    sightings, slot, progress = sightings_of(problem), free_slots(problem), Progress()
+    equations = NormalEquations.zeros(int(slot.max(initial=-1)) + 1, 6, 0, len(problem.points_world))
+    progress.costs.append(total_cost(variables.views(slot), sightings, variables.points, weight))
+    for _ in range(steps):
+        moved, cost, delta, gradient = _inner_sweeps(variables, slot, sightings, weight, equations)
+        for _ in range(STEP_HALVINGS):
+            if cost <= progress.costs[-1]:
+                break
+            delta = 0.5 * delta
+            moved = _at(variables, slot, delta, variables.points + 0.5 * (moved.points - variables.points))
+            cost = total_cost(moved.views(slot), sightings, moved.points, weight)
+        if not cost <= progress.costs[-1]:
+            progress.stopped = "no descent"
+            break
+        pose, point = np.linalg.norm(delta, axis=1), np.linalg.norm(moved.points - variables.points, axis=1)
+        progress.steps.append((gradient, float(pose.max(initial=0.0)), float(point.max(initial=0.0))))
+        progress.costs.append(cost)
+        variables = moved
+        if progress.costs[-2] - progress.costs[-1] <= relative_gain * progress.costs[-2]:
+            progress.stopped = "gain"
+            break
+    return variables, progress
+
+
+def _inner_sweeps(
+    variables: Variables, slot: Array, sightings: Sightings, weight: float, equations: NormalEquations
+) -> tuple[Variables, float, Array, float]:
+    """Where the sweeps over H dx = -g lead, the cost there, the cameras' steps (F, 6) and the norm of the gradient."""
+    views, delta, scratch = variables.views(slot), np.zeros((len(equations.H_cameras), 6)), new_scratch()
+    accumulate(views, sightings, variables.points, np.zeros((8, 0)), weight, 0.0, BLOCK_DAMPING, equations, is_reduced=False)
+    gradient = float(np.sqrt((equations.gradient**2).sum() + (equations.point_gradient**2).sum()))
+    moved, cost = _at(variables, slot, delta, variables.points.copy()), np.inf
+    for _ in range(INNER_SWEEPS):
+        solve_cameras(views, sightings, variables.points, moved.points, weight, scratch, delta)
+        moved = _at(variables, slot, delta, moved.points)
+        cost = move_points(views, moved.views(slot), sightings, variables.points, delta, weight, 0.0, equations, moved.points)
+    return moved, cost, delta, gradient
+
+
+def _at(variables: Variables, slot: Array, delta: Array, points: Array) -> Variables:
+    """The cameras after steps delta (F, 6), and these points."""
+    moved = Variables(np.empty_like(variables.R), np.empty_like(variables.t), points, variables.models)
+    move_cameras(variables.views(slot), delta, moved.R, moved.t)
+    return moved
