@@ -47,6 +47,7 @@ INGREDIENTS: tuple[tuple[str, str, Any], ...] = (
     ("motion prior before RANSAC", "localization.prior_inlier_ratio", 2.0),
     ("more than 2000 tracks", "extrema.max_tracks", 2000),
     ("refined calibration", "calibration.refine", "off"),
+    ("rolling shutter", "calibration.readout", False),
     ("final adjustment", "final_adjustment.enabled", False),
 )
 """Ingredient, setting, its value without the ingredient; lines of one name belong together. A new ingredient is a line."""
