@@ -49,12 +49,12 @@ class CurvatureConfig:
 class ExtremaConfig:
     """Sec. 2.1: which maxima of the curvature become tracks."""
 
-    min_curvature: float = 0.12
+    min_curvature: float = 0.15
     """Noise floor of kappa, grey levels³ per pixel⁴ of the smoothed 0–255 image."""
-    max_tracks: int = 8500
+    max_tracks: int = 5300
     refill_interval: int = 1
     """Frames between two refills with free extrema."""
-    min_distance_px: float = 3.0
+    min_distance_px: float = 4.0
     """New extrema keep this distance from live tracks and from each other."""
     border_px: int = 8
 
@@ -137,7 +137,7 @@ class LocalizationConfig:
 class KeyframeConfig:
     """When a frame becomes a keyframe."""
 
-    motion_px: float = 10.0
+    motion_px: float = 12.0
     """Median motion of the landmarks since the last keyframe."""
     min_tracked_ratio: float = 0.6
     """A keyframe is also due when fewer of the last keyframe's landmarks are still tracked."""
@@ -455,8 +455,6 @@ def paper_config() -> Config:
     return Config(
         mode="paper",
         curvature=CurvatureConfig(smoothing_sigma_px=2.5),
-        extrema=ExtremaConfig(min_curvature=0.15, max_tracks=5300, min_distance_px=4.0),
-        keyframes=KeyframeConfig(motion_px=12.0),
         extrema_tracking=ExtremaTrackingConfig(prediction="dominant_flow", gate_px=8.0, coast_frames=0),
         localization=LocalizationConfig(prior_inlier_ratio=2.0, outlier_medians=100.0),
         recovery=RecoveryConfig(enabled=False),
@@ -472,7 +470,7 @@ def paper_config() -> Config:
 
 
 def live_config(base: Config) -> Config:
-    """`base` for cameras that do not wait: fewer tracks and keyframes, smaller windows, and meshes made soon after their pictures.
+    """`base` for cameras that do not wait: fewer keyframes, smaller windows, and meshes made soon after their pictures.
 
     Nothing is adjusted again at the end: the mesh is there already. The volume is ours, since Open3D's lets no other thread run
     while it integrates a view.
@@ -480,7 +478,6 @@ def live_config(base: Config) -> Config:
     change = dataclasses.replace
     return change(
         base,
-        extrema=change(base.extrema, min_curvature=0.15, max_tracks=min(5300, base.extrema.max_tracks), min_distance_px=4.0),
         keyframes=change(base.keyframes, motion_px=20.0),
         window=change(base.window, keyframes=10, anchors=min(20, base.window.anchors), settled_keyframes=3, settled_frames=15),
         bundle_adjustment=change(base.bundle_adjustment, keyframe_iterations=3, sweeps_per_frame=0),

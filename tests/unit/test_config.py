@@ -47,7 +47,7 @@ def test_a_file_changes_only_what_it_names(tmp_path):
         ("seed = true", "seed must be like 0"),
         ("seed = '1'", "seed must be like 0"),
         ("[recovery]\nenabled = 1", "recovery.enabled must be like True"),
-        ("[extrema]\nmin_curvature = 'low'", "extrema.min_curvature must be like 0.12"),
+        ("[extrema]\nmin_curvature = 'low'", "extrema.min_curvature must be like 0.15"),
         ("[fusion]\nvoxel_high = 'fine'", "fusion.voxel_high must be like None"),
         ("[extrema_tracking]\nprediction = 'dense-flow'", "extrema_tracking.prediction must be one of"),
         ("[bundle_adjustment]\nkeyframe_solver = 'ceres'", "bundle_adjustment.keyframe_solver must be one of"),
@@ -79,7 +79,7 @@ def test_the_paper_differs_where_the_paper_does():
     assert paper.mode == "paper" and paper.extrema_tracking.prediction == "dominant_flow"
     assert not paper.recovery.enabled and paper.window.anchors == 0
     assert paper.bundle_adjustment.keyframe_solver == "subspace"
-    same = ("dominant_flow", "initialization", "triangulation", "nltgv")
+    same = ("dominant_flow", "initialization", "triangulation", "nltgv", "extrema")
     assert all(getattr(paper, group) == getattr(Config(), group) for group in same)
 
 

@@ -28,7 +28,7 @@ def test_each_stage_is_a_part_of_the_one_before(slam):
 def test_every_track_that_is_no_more_has_a_reason(slam):
     assert sum(slam.ends.values()) == slam._next_id + slam.second_lives - len(slam.tracks) and slam.second_lives > 0
     assert slam.ends[REASONS[1]] > slam.ends[REASONS[7]] == 0
-    assert 200 < funnel.good_per_keyframe(slam) < 8500
+    assert 200 < funnel.good_per_keyframe(slam) < 5300
 
 
 def test_the_table_is_printed_and_written(tmp_path: Path, capsys):
