@@ -31,6 +31,7 @@ from benchmark_tracking import DEMO, klt_milliseconds
 from vitamin3d.benchmark.published import TABLE_2_MS, TABLE_3_MS
 from vitamin3d.benchmark.tables import PARTS
 from vitamin3d.bundle_adjustment.adjust import adjust_bundle
+from vitamin3d.bundle_adjustment.marginalization import CameraPrior
 from vitamin3d.bundle_adjustment.problem import BundleProblem
 from vitamin3d.config import Config, live_config, load_toml, paper_config
 from vitamin3d.datasets import Dataset, Unreadable, open_dataset
@@ -81,11 +82,11 @@ class TimedSlam(Slam):
         self._rival = rival
         self._schur = dataclasses.replace(config.bundle_adjustment, keyframe_solver="schur")
 
-    def _solved(self, window: Window, problem: BundleProblem) -> WindowAdjustment:
+    def _solved(self, window: Window, problem: BundleProblem, prior: CameraPrior | None) -> WindowAdjustment:
         if self._rival is not None and self.map.num_keyframes % SCHUR_INTERVAL == 0:
             with self._rival.timed(SCHUR):
-                adjust_bundle(problem, self.camera, self._schur)
-        return super()._solved(window, problem)
+                adjust_bundle(problem, self.camera, self._schur, prior)
+        return super()._solved(window, problem, prior)
 
 
 @dataclasses.dataclass

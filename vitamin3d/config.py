@@ -21,6 +21,7 @@ else:
 CHOICES = {
     "extrema_tracking.prediction": ("dense_flow", "dominant_flow"),
     "bundle_adjustment.keyframe_solver": ("subspace-accelerated", "schur", "subspace", "subspace-inner"),
+    "window.past": ("anchors", "prior"),
     "fusion.backend": ("blocks", "scalable", "voxel_block_grid"),
     "calibration.refine": ("auto", "on", "off"),
 }
@@ -192,6 +193,8 @@ class WindowConfig:
     """Which keyframes take part in an adjustment."""
 
     keyframes: int = 20
+    past: str = "anchors"
+    """What holds the window: `anchors`, or `prior`: what keyframes knew when they left it (cheaper in long maps, less accurate)."""
     anchors: int = 60
     """Older keyframes, poses fixed, that share most landmarks with the window."""
     min_shared_landmarks: int = 20

@@ -6,6 +6,7 @@ from dataclasses import replace
 import numpy as np
 
 from vitamin3d.bundle_adjustment.adjust import adjust_bundle
+from vitamin3d.bundle_adjustment.marginalization import CameraPrior
 from vitamin3d.bundle_adjustment.problem import BundleProblem
 from vitamin3d.bundle_adjustment.schur import adjust_accelerated
 from vitamin3d.bundle_adjustment.subspace import adjust_subspace
@@ -29,6 +30,7 @@ from vitamin3d.mapping.relocalization import relocalize
 from vitamin3d.mapping.sparse_map import SparseMap
 from vitamin3d.mapping.two_view_initialization import initialize_from_two_views
 from vitamin3d.mapping.window_adjustment import AdjustAtOnce, Adjuster, WindowAdjustment, store_adjustment
+from vitamin3d.mapping.window_prior import WindowPrior
 from vitamin3d.mapping.window_selection import Window, build_problem, select_frame_window, select_window, store_solution, whole_map
 from vitamin3d.tracking.extrema import refine_extrema, select_free_extrema
 from vitamin3d.tracking.extrema_tracking import predict_by_dense_flow, predict_by_dominant_flow, track_extrema
@@ -54,6 +56,7 @@ class Slam:
         self.calibration = CalibrationRefinement(camera, config.calibration)
         self.adjuster: Adjuster = AdjustAtOnce()
         self.adjustments_skipped = 0
+        self._past = WindowPrior(config)
         self._history = InitializationHistory(config.initialization)
         self._pending_frames: dict[int, Frame] = {}
         self._meetings: list[Array] = []
@@ -274,15 +277,19 @@ class Slam:
         if self.adjuster.is_busy:
             self.adjustments_skipped += 1
             return
-        window = select_window(self.map, self.config.window)
-        problem = build_problem(self.map, window)
-        self.adjuster.begin(lambda: self._solved(window, problem))
+        if self.config.window.past == "prior":
+            window, problem = self._past.advance(self.map, self.camera)
+        else:
+            window = select_window(self.map, self.config.window)
+            problem = build_problem(self.map, window)
+        prior = self._past.prior
+        self.adjuster.begin(lambda: self._solved(window, problem, prior))
         self.take_adjustment()
 
-    def _solved(self, window: Window, problem: BundleProblem) -> WindowAdjustment:
+    def _solved(self, window: Window, problem: BundleProblem, prior: CameraPrior | None) -> WindowAdjustment:
         """Runs on the adjuster's thread."""
         with self.times.timed("bundle_adjustment_keyframe"):
-            return WindowAdjustment(window, adjust_bundle(problem, self.camera, self.config.bundle_adjustment)[0])
+            return WindowAdjustment(window, adjust_bundle(problem, self.camera, self.config.bundle_adjustment, prior)[0])
 
     def take_adjustment(self, wait: bool = False) -> None:
         """The window that was adjusted meanwhile enters the map; its outliers leave the map and the tracks."""
@@ -307,6 +314,7 @@ class Slam:
             self.tracks = replace(self.tracks, ids=renamed)
             self._meetings = [np.searchsorted(done.kept_ids, pair) for pair in self._meetings]
             self._pending_frames = {int(np.searchsorted(done.kept_keyframes, k)): f for k, f in self._pending_frames.items()}
+            self._past.forget()
             self.map, self._next_id, self._num_condensed = done.map, len(done.kept_ids), len(done.kept_ids)
 
     def unique_ids(self, ids: Array) -> Array:
@@ -324,6 +332,7 @@ class Slam:
         """The camera's parameters from all of the map (or as they were); the map moves along."""
         with self.times.timed("self_calibration"):
             self.camera = self.calibration.refine(self.map, self.camera)
+            self._past.forget()
 
     def _remove_outliers(self, window: Window, solved: BundleProblem, limit_px: float) -> None:
         is_outlier = squared_reprojection_errors(solved, self.camera) > limit_px**2

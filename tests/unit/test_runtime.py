@@ -209,10 +209,10 @@ def test_live_windows_are_adjusted_beside_the_tracking(demo):
     slam, record = Slam(demo.camera, CONFIG), RunRecord()
     threads, solved = set(), slam._solved
 
-    def watched(window, problem):
+    def watched(*task):
         threads.add(threading.current_thread().name)
         time.sleep(0.15)
-        return solved(window, problem)
+        return solved(*task)
 
     slam._solved = watched
     run_live(demo, range(90), FrontEnd(CONFIG), slam, record=record)

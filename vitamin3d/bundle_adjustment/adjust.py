@@ -154,7 +154,11 @@ def _restored(problem: BundleProblem, usable: BundleProblem, variables: Variable
     return dataclasses.replace(problem, T_cam_world=poses, points_world=points)
 
 
-def adjust_bundle(problem: BundleProblem, camera: Camera, config: BundleAdjustmentConfig) -> tuple[BundleProblem, BundleReport]:
-    """The window's adjustment at a keyframe, by the solver that the settings name."""
-    solver = SOLVERS[config.keyframe_solver]
-    return solver(problem, camera, config.sigma_px, config.keyframe_iterations, config.relative_gain)
+def adjust_bundle(
+    problem: BundleProblem, camera: Camera, config: BundleAdjustmentConfig, prior: CameraPrior | None = None
+) -> tuple[BundleProblem, BundleReport]:
+    """The window's adjustment at a keyframe, by the solver that the settings name; a prior needs one that eliminates points."""
+    if prior is not None:
+        solver = adjust_schur if config.keyframe_solver == "schur" else adjust_accelerated
+        return solver(problem, camera, config.sigma_px, config.keyframe_iterations, config.relative_gain, prior)
+    return SOLVERS[config.keyframe_solver](problem, camera, config.sigma_px, config.keyframe_iterations, config.relative_gain)

@@ -168,17 +168,17 @@ def _solve_weak(M: Array, rest: Array) -> Array:
 
 
 def adjust_accelerated(
-    problem: BundleProblem, camera: Camera, sigma_px: float, iterations: int, relative_gain: float = 1e-5
+    problem: BundleProblem, camera: Camera, sigma_px: float, iterations: int, relative_gain: float = 1e-5, prior: CameraPrior | None = None
 ) -> tuple[BundleProblem, BundleReport]:
     """Like `adjust_schur`, with a sweep of the subspace method over the points (Eq. 12) in each step.
 
     All cameras move together and then each point alone, by its own non-linear equations: fewer steps, each a fifth longer.
     """
-    return _adjust(problem, camera, sigma_px, iterations, relative_gain, 1)
+    return _adjust(problem, camera, sigma_px, iterations, relative_gain, 1, prior)
 
 
 def adjust_schur(
-    problem: BundleProblem, camera: Camera, sigma_px: float, iterations: int, relative_gain: float = 1e-5
+    problem: BundleProblem, camera: Camera, sigma_px: float, iterations: int, relative_gain: float = 1e-5, prior: CameraPrior | None = None
 ) -> tuple[BundleProblem, BundleReport]:
     """Levenberg–Marquardt with the points eliminated, Geman–McClure weights; the cost never rises.
 
@@ -186,14 +186,21 @@ def adjust_schur(
         The solved problem, and a report with the cost after each accepted or refused step; it ends when a step gains less than
         relative_gain.
     """
-    return _adjust(problem, camera, sigma_px, iterations, relative_gain, 0)
+    return _adjust(problem, camera, sigma_px, iterations, relative_gain, 0, prior)
 
 
 def _adjust(
-    problem: BundleProblem, camera: Camera, sigma_px: float, iterations: int, relative_gain: float, point_sweeps: int
+    problem: BundleProblem,
+    camera: Camera,
+    sigma_px: float,
+    iterations: int,
+    relative_gain: float,
+    sweeps: int,
+    prior: CameraPrior | None,
 ) -> tuple[BundleProblem, BundleReport]:
     system = ReducedSystem(sightings_of(problem), free_slots(problem), sigma_px)
-    variables, progress = minimise(system, Variables.of(problem, pinhole_model(camera)), iterations, relative_gain, point_sweeps)
+    system.camera_prior = prior
+    variables, progress = minimise(system, Variables.of(problem, pinhole_model(camera)), iterations, relative_gain, sweeps)
     return variables.written_to(problem), progress.report(system.squared_errors(variables), sigma_px)
 
 
