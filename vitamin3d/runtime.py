@@ -7,6 +7,7 @@ never lets a frame wait for the back end: windows are adjusted on a thread of th
 keyframes for which the dense half has no time are not meshed.
 """
 
+import gc
 from collections.abc import Callable, Iterable, Iterator
 from contextlib import ExitStack
 from dataclasses import dataclass, field
@@ -198,6 +199,9 @@ def run_live(
         fronts = threads.enter_context(_fronts_ahead(threads, _pictures(dataset, indices), front_end, clock))
         if clock is not None:
             threads.callback(clock.cancel)
+        gc.collect()
+        gc.freeze()  # what is there now is not looked through again while pictures come
+        threads.callback(gc.unfreeze)
         run = _Run(slam, record, observer or SilentObserver(), _hand_or_drop(slam, record, dense), clock)
         run.all_frames(fronts)
         record.adjustments_skipped = slam.adjustments_skipped
