@@ -280,6 +280,8 @@ class MemoryConfig:
     """Of max_keyframes, at a time."""
     max_new_tracks: int = 1_000_000
     """When so many were born, those that ended and are no landmarks are forgotten."""
+    min_observations: int = 3
+    """And landmarks out of view that have fewer: they are neither found again nor exported."""
 
 
 @dataclass(frozen=True)

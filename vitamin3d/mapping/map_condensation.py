@@ -70,5 +70,5 @@ def condense(sparse_map: SparseMap, needed_ids: Array, num_recent: int, config: 
     number = int(np.ceil(config.dropped_share * config.max_keyframes)) if excess > 0 else 0
     dropped = redundant_keyframes(sparse_map, number, num_recent) if number else np.zeros(0, np.int64)
     kept_keyframes = np.setdiff1d(np.arange(sparse_map.num_keyframes), dropped)
-    smaller, kept_ids = sparse_map.condensed(kept_keyframes, needed_ids)
+    smaller, kept_ids = sparse_map.condensed(kept_keyframes, needed_ids, config.min_observations, num_recent)
     return Condensation(smaller, kept_keyframes, kept_ids)

@@ -245,12 +245,13 @@ class SparseMap:
         self._count.view[kept], self._first.view[kept], self._last.view[kept] = count[kept], first[kept], last[kept]
         self.remove_landmarks(gone)
 
-    def condensed(self, keyframes: Array, needed_ids: Array) -> tuple["SparseMap", Array]:
+    def condensed(self, keyframes: Array, needed_ids: Array, min_observations: int = 2, num_recent: int = 0) -> tuple["SparseMap", Array]:
         """A copy with some keyframes only, and without what counts no more; ids and keyframes are numbered anew in their order.
 
         Args:
             keyframes: (K',) ascending, that stay.
             needed_ids: (N,) tracks that stay whether they are landmarks or not; may be larger than any in the map.
+            min_observations: of a landmark that stays though it is neither needed nor observed in the `num_recent` newest keyframes.
 
         Returns:
             The copy, and (I',) the old ids that have new ones, ascending; the new id is the position.
@@ -262,7 +263,8 @@ class SparseMap:
         counts = self.obs_valid & (first >= 0) & (np.arange(len(first)) >= first) & np.repeat(stays, np.diff(self.keyframe_starts))
         count = np.bincount(self.obs_landmark[counts], minlength=size)
         is_landmark = ~np.isnan(self.points_world[:, 0]) & (count >= 2)
-        kept = np.union1d(np.flatnonzero(is_landmark), needed_ids)
+        is_recent = self.last_observation >= self.keyframe_starts[max(0, self.num_keyframes - num_recent)]
+        kept = np.union1d(np.flatnonzero(is_landmark & (is_recent | (count >= min_observations))), needed_ids)
         known = kept[kept < size]
         new_id = np.full(size, -1, np.int64)
         new_id[known] = np.arange(len(known))
