@@ -484,12 +484,13 @@ def live_config(base: Config) -> Config:
     return change(
         base,
         keyframes=change(base.keyframes, motion_px=20.0),
-        window=change(base.window, keyframes=10, anchors=min(20, base.window.anchors), settled_keyframes=3, settled_frames=15),
+        window=change(base.window, keyframes=10, anchors=min(20, base.window.anchors), settled_keyframes=2, settled_frames=10),
         bundle_adjustment=change(base.bundle_adjustment, keyframe_iterations=3, sweeps_per_frame=0),
         final_adjustment=change(base.final_adjustment, enabled=False),
         calibration=change(base.calibration, refine="off"),
         memory=change(base.memory, max_keyframes=600, max_new_tracks=60_000),
-        densification=change(base.densification, reach=4, planes=32),
+        densification=change(base.densification, reach=3, planes=32),
+        nltgv=change(base.nltgv, iterations=min(200, base.nltgv.iterations)),
         consistency=change(base.consistency, near=1, far=1),
         fusion=change(base.fusion, keyframes_for_depth=10, backend="blocks"),
     )

@@ -231,9 +231,9 @@ class _Dense:
             self.output.write_view(view, self.scale)
 
     def add_all(self, snapshots: Iterable[MapSnapshot], done: Callable[[DepthView], None] | None = None) -> None:
-        """All keyframes that come; their views are computed ahead of the fusion."""
-        views = _named("meshing", self._views(snapshots))
-        for view in run_ahead(views, "meshing", DENSE_NICENESS if self.job.live else 0) if self.job.threads else views:
+        """All keyframes that come; densified ahead of meshing, meshed ahead of the fusion."""
+        densified = self._beside(_named("densification", self._densified(snapshots)), "densification")
+        for view in self._beside(_named("meshing", self._views(densified)), "meshing"):
             with step(f"fusing the view of {view.timestamp_ns / 1e9:.3f} s"):
                 self._begun().fuse(view)
             if self.clock is not None:
@@ -243,11 +243,23 @@ class _Dense:
             if done is not None:
                 done(view)
 
+    def _beside(self, source: Iterator[Any], name: str) -> Iterator[Any]:
+        """The items of a generator, computed on a thread of its own where there are any; in live runs just one ahead."""
+        if not self.job.threads:
+            return source
+        return run_ahead(source, name, DENSE_NICENESS, 1) if self.job.live else run_ahead(source, name)
+
+    def _densified(self, snapshots: Iterable[MapSnapshot]) -> Iterator[MapSnapshot]:
+        for snapshot in snapshots:
+            yield from self._begun().densified_ready(snapshot)
+        if self.reconstruction is not None:
+            yield from self.reconstruction.last_densified()
+
     def _views(self, snapshots: Iterable[MapSnapshot]) -> Iterator[DepthView]:
         for snapshot in snapshots:
-            yield from self._begun().depth_views_ready(snapshot)
+            yield from self._begun().drawn_ready(snapshot)
         if self.reconstruction is not None:
-            yield from self.reconstruction.last_depth_views()
+            yield from self.reconstruction.last_drawn()
 
     def _begun(self) -> Reconstruction:
         if self.reconstruction is None:

@@ -67,11 +67,31 @@ class Reconstruction:
 
     def depth_views_ready(self, snapshot: MapSnapshot) -> Iterator[DepthView]:
         """Takes a keyframe, in the order of time; the views that have all their neighbours by now, not fused yet."""
-        yield from self._views(self._ready(snapshot))
+        for denser in self.densified_ready(snapshot):
+            yield from self.drawn_ready(denser)
 
     def last_depth_views(self) -> Iterator[DepthView]:
         """The views of keyframes that waited for neighbours, not fused yet: none will follow."""
-        yield from self._views(self._keyframes.flush())
+        for denser in self.last_densified():
+            yield from self.drawn_ready(denser)
+        yield from self.last_drawn()
+
+    def densified_ready(self, snapshot: MapSnapshot) -> Iterator[MapSnapshot]:
+        """Takes a keyframe, in the order of time; with more vertices those that have all their neighbours by now."""
+        yield from map(self._densified, self._ready(snapshot))
+
+    def last_densified(self) -> Iterator[MapSnapshot]:
+        """Those that waited for neighbours: none will follow."""
+        yield from map(self._densified, self._keyframes.flush())
+
+    def drawn_ready(self, snapshot: MapSnapshot) -> Iterator[DepthView]:
+        """Meshes, denoises and draws a keyframe; each view comes out when those around it are there to confirm it."""
+        view = self.depth_view(snapshot)
+        if view is not None:
+            yield from map(self._checked, self._drawn.push(view))
+
+    def last_drawn(self) -> Iterator[DepthView]:
+        """The views that waited for those around them: none will follow."""
         yield from map(self._checked, self._drawn.flush())
 
     def forget_waiting(self) -> None:
@@ -91,16 +111,11 @@ class Reconstruction:
             return [Around(CanvasPicture(snapshot, NO_PICTURE, NO_PICTURE), [], [])]
         return self._keyframes.push(canvas_picture(snapshot, self.renderer.draw_gray(snapshot.frame), self.renderer.is_outside))
 
-    def _views(self, ready: list[Around[CanvasPicture]]) -> Iterator[DepthView]:
-        """Densifies and draws keyframes; each comes out when the views around it are there to confirm it."""
-        for around in ready:
-            snapshot = around.item.snapshot
-            if self.config.densification.enabled:
-                with self.times.timed("densification"):
-                    snapshot = self._densifier.densify(around)
-            view = self.depth_view(snapshot)
-            if view is not None:
-                yield from map(self._checked, self._drawn.push(view))
+    def _densified(self, around: Around[CanvasPicture]) -> MapSnapshot:
+        if not self.config.densification.enabled:
+            return around.item.snapshot
+        with self.times.timed("densification"):
+            return self._densifier.densify(around)
 
     def _checked(self, around: Around[DepthView]) -> DepthView:
         config = self.config.consistency

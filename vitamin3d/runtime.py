@@ -208,9 +208,9 @@ def run_live(
         return record
 
 
-def run_ahead(source: Iterator[Any], name: str, niceness: int = 0) -> Iterator[Any]:
-    """The items of a generator, computed on a thread of its own a few items ahead; what it raises comes out here."""
-    with ReadAhead(source, name, READ_AHEAD, niceness) as items:
+def run_ahead(source: Iterator[Any], name: str, niceness: int = 0, size: int = READ_AHEAD) -> Iterator[Any]:
+    """The items of a generator, computed on a thread of its own `size` items ahead; what it raises comes out here."""
+    with ReadAhead(source, name, size, niceness) as items:
         yield from items
 
 
