@@ -192,6 +192,9 @@ def run_live(
     record = _begin(indices, record)
     record.latencies = [] if clock is not None else None
     with ExitStack() as threads:
+        gc.collect()
+        gc.freeze()  # what is there now is not looked through again while pictures come
+        threads.callback(gc.unfreeze)
         dense = threads.enter_context(Consumer(consume, "dense", LIVE_SNAPSHOTS_AHEAD, DENSE_NICENESS)) if consume else None
         adjuster: Errand[WindowAdjustment] = Errand("adjustment", ADJUSTMENT_NICENESS)
         slam.adjuster = threads.enter_context(adjuster)
@@ -199,9 +202,6 @@ def run_live(
         fronts = threads.enter_context(_fronts_ahead(threads, _pictures(dataset, indices), front_end, clock))
         if clock is not None:
             threads.callback(clock.cancel)
-        gc.collect()
-        gc.freeze()  # what is there now is not looked through again while pictures come
-        threads.callback(gc.unfreeze)
         run = _Run(slam, record, observer or SilentObserver(), _hand_or_drop(slam, record, dense), clock)
         run.all_frames(fronts)
         record.adjustments_skipped = slam.adjustments_skipped
