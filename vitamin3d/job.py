@@ -4,7 +4,7 @@
 import dataclasses
 from bisect import bisect_right
 from collections.abc import Callable, Iterable, Iterator
-from contextlib import suppress
+from contextlib import ExitStack, suppress
 from dataclasses import dataclass
 from typing import Any
 
@@ -17,13 +17,13 @@ from vitamin3d.mapping.landmark_statistics import point_cloud
 from vitamin3d.reconstruction import Reconstruction
 from vitamin3d.run_report import write_report
 from vitamin3d.run_statistics import Stopwatch, live_table, run_statistics
-from vitamin3d.runtime import DENSE_NICENESS, Observer, RunRecord, run_ahead, run_live, run_sequential, run_threaded
+from vitamin3d.runtime import DENSE_NICENESS, READ_AHEAD, Observer, RunRecord, run_live, run_sequential, run_threaded
 from vitamin3d.scale import Scale, scale_from_ground_truth
 from vitamin3d.slam import Slam
 from vitamin3d.tracking.front_end import FrontEnd
 from vitamin3d.types import DepthView, MapSnapshot
 from vitamin3d.warmup import warm_up
-from vitamin3d.workers import Clock, step
+from vitamin3d.workers import Clock, Closable, Items, ReadAhead, step
 
 VOXEL_LOW_M, VOXEL_HIGH_M = 0.15, 0.025
 """Table 3 of the paper; the defaults where the scale is known."""
@@ -232,22 +232,30 @@ class _Dense:
 
     def add_all(self, snapshots: Iterable[MapSnapshot], done: Callable[[DepthView], None] | None = None) -> None:
         """All keyframes that come; densified ahead of meshing, meshed ahead of the fusion."""
-        densified = self._beside(_named("densification", self._densified(snapshots)), "densification")
-        for view in self._beside(_named("meshing", self._views(densified)), "meshing"):
-            with step(f"fusing the view of {view.timestamp_ns / 1e9:.3f} s"):
-                self._begun().fuse(view)
-            if self.clock is not None:
-                self.mesh_lags.append(self.clock.seconds_since(view.timestamp_ns))
-            with step("writing depth and normal maps"):
-                self.output.write_view(view, self.scale)
-            if done is not None:
-                done(view)
+        with ExitStack() as threads:
+            waited_for = snapshots if isinstance(snapshots, Items) else None
+            densified = self._beside(threads, "densification", self._densified(snapshots), waited_for)
+            for view in self._beside(threads, "meshing", self._views(densified), densified if isinstance(densified, ReadAhead) else None):
+                self._fuse(view)
+                if done is not None:
+                    done(view)
 
-    def _beside(self, source: Iterator[Any], name: str) -> Iterator[Any]:
+    def _fuse(self, view: DepthView) -> None:
+        """Fuses a view and writes its maps."""
+        with step(f"fusing the view of {view.timestamp_ns / 1e9:.3f} s"):
+            self._begun().fuse(view)
+        if self.clock is not None:
+            self.mesh_lags.append(self.clock.seconds_since(view.timestamp_ns))
+        with step("writing depth and normal maps"):
+            self.output.write_view(view, self.scale)
+
+    def _beside(self, threads: ExitStack, name: str, source: Iterator[Any], upstream: Closable | None) -> Iterable[Any]:
         """The items of a generator, computed on a thread of its own where there are any; in live runs just one ahead."""
+        source = _named(name, source)
         if not self.job.threads:
             return source
-        return run_ahead(source, name, DENSE_NICENESS, 1) if self.job.live else run_ahead(source, name)
+        size, niceness = (1, DENSE_NICENESS) if self.job.live else (READ_AHEAD, 0)
+        return threads.enter_context(ReadAhead(source, name, size, niceness, upstream))
 
     def _densified(self, snapshots: Iterable[MapSnapshot]) -> Iterator[MapSnapshot]:
         for snapshot in snapshots:

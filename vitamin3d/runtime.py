@@ -11,7 +11,7 @@ import gc
 from collections.abc import Callable, Iterable, Iterator
 from contextlib import ExitStack
 from dataclasses import dataclass, field
-from typing import Any, Protocol
+from typing import Protocol
 
 import cv2
 import numpy as np
@@ -208,12 +208,6 @@ def run_live(
         return record
 
 
-def run_ahead(source: Iterator[Any], name: str, niceness: int = 0, size: int = READ_AHEAD) -> Iterator[Any]:
-    """The items of a generator, computed on a thread of its own `size` items ahead; what it raises comes out here."""
-    with ReadAhead(source, name, size, niceness) as items:
-        yield from items
-
-
 def _begin(indices: range, record: RunRecord | None) -> RunRecord:
     cv2.setNumThreads(1)
     record = record if record is not None else RunRecord()
@@ -244,7 +238,7 @@ def _front_frames(
 
 def _fronts_ahead(threads: ExitStack, pictures: Iterator[Frame | Unreadable], front_end: FrontEnd, clock: Clock | None) -> ReadAhead:
     decoded = threads.enter_context(ReadAhead(pictures, "decoding", READ_AHEAD))
-    return ReadAhead(_front_frames(decoded, front_end, clock), "front-end", READ_AHEAD)
+    return ReadAhead(_front_frames(decoded, front_end, clock), "front-end", READ_AHEAD, upstream=decoded)
 
 
 def _each_to(sink: SnapshotSink) -> SnapshotConsumer:

@@ -12,7 +12,7 @@ import threading
 import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
-from typing import Any, Generic, TypeVar
+from typing import Any, Generic, Protocol, TypeVar
 
 from vitamin3d.errors import Vitamin3dError, WorkerError
 
@@ -106,24 +106,55 @@ class _Thread:
             raise self._error
 
 
-class ReadAhead(_Thread):
-    """Iterates a generator on a thread of its own, at most `size` items ahead; its exception comes out here."""
+class Closable(Protocol):
+    """Something that another thread may wait for."""
 
-    def __init__(self, source: Iterator[Any], name: str, size: int, niceness: int = 0) -> None:
+    def close(self) -> None: ...
+
+
+class Items(Iterator[Any]):
+    """What comes through a channel until its end; `close` says that no more is wanted, to both ends."""
+
+    def __init__(self, channel: Channel) -> None:
+        self._channel = channel
+
+    def __next__(self) -> Any:
+        item = self._channel.get()
+        if item is _END:
+            raise StopIteration
+        return item
+
+    def close(self) -> None:
+        self._channel.close()
+
+
+class ReadAhead(_Thread):
+    """Iterates a generator on a thread of its own, at most `size` items ahead; its exception comes out here.
+
+    Args:
+        upstream: what the generator may wait for, closed with this so that nobody waits for ever.
+    """
+
+    def __init__(self, source: Iterator[Any], name: str, size: int, niceness: int = 0, upstream: Closable | None = None) -> None:
         super().__init__(name, niceness)
-        self._source, self._channel = source, Channel(size)
+        self._source, self._channel, self._upstream = source, Channel(size), upstream
 
     def __enter__(self) -> "ReadAhead":
         self._thread.start()
         return self
 
     def __exit__(self, *_: object) -> None:
-        self._channel.close()
+        self.close()
         self._thread.join()
 
+    def close(self) -> None:
+        """No more is wanted."""
+        self._channel.close()
+        if self._upstream is not None:
+            self._upstream.close()
+
     def __iter__(self) -> Iterator[Any]:
-        while (item := self._channel.get()) is not _END:
-            yield item
+        yield from Items(self._channel)
         self._raise()
 
     def _work(self) -> None:
@@ -153,7 +184,7 @@ class Consumer(_Thread):
         with contextlib.suppress(Stopped):
             self._channel.put(_END)
         self._thread.join()
-        if kind is None:
+        if kind is None or kind is Stopped:
             self._raise()
 
     @property
@@ -167,12 +198,8 @@ class Consumer(_Thread):
             self._raise()
             raise
 
-    def _items(self) -> Iterator[Any]:
-        while (item := self._channel.get()) is not _END:
-            yield item
-
     def _work(self) -> None:
-        self._consume(self._items())
+        self._consume(Items(self._channel))
 
     def _end(self) -> None:
         self._channel.close()
