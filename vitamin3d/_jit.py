@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The one numba decorator of the project (the only file that imports numba).
+"""The one numba decorator of the project (only `_lanes.py` imports numba besides).
 
 `nogil` lets the threads of `runtime.py` overlap, `cache` keeps compiled kernels between runs. Never `parallel`
 (two Python threads inside parallel kernels abort the process) and never `fastmath` (NaN is our "invalid").
