@@ -34,8 +34,9 @@ AT_LEAST_ONE = (
     "window.keyframes",
     "densification.keyframe_stride",
     "densification.reach",
-    "consistency.near",
-    "consistency.far",
+    "consistency.first",
+    "consistency.spacing",
+    "consistency.per_side",
 )
 
 
@@ -379,17 +380,29 @@ class DepthRenderingConfig:
 
 @dataclass(frozen=True)
 class ConsistencyConfig:
-    """Before fusion, a depth that the views around it contradict, and none confirms, loses weight."""
+    """Before fusion, the views around a view confirm or contradict its depths: their votes change the weights."""
 
     enabled: bool = True
-    near: int = 2
-    """The other views are the ones so many before and after in the order of fusion,"""
-    far: int = 5
-    """and so many."""
+    first: int = 2
+    """The voters are the views so many before and after in the order of fusion,"""
+    spacing: int = 3
+    """and the ones so many further,"""
+    per_side: int = 3
+    """together so many on each side."""
     tolerance: float = 0.03
     """Relative difference of depth up to which a view confirms."""
     contradicted_weight: float = 0.1
-    """Factor."""
+    """Factor of a depth that more views contradict than confirm."""
+
+    @property
+    def offsets(self) -> tuple[int, ...]:
+        """Distances to the voters in the order of fusion."""
+        return tuple(self.first + self.spacing * k for k in range(self.per_side))
+
+    @property
+    def reach(self) -> int:
+        """Distance to the farthest voter."""
+        return self.offsets[-1]
 
 
 @dataclass(frozen=True)

@@ -8,7 +8,7 @@ from dataclasses import replace
 import numpy as np
 
 from vitamin3d.config import Config
-from vitamin3d.dense.consistency import doubted
+from vitamin3d.dense.consistency import voted
 from vitamin3d.dense.delaunay import triangulate
 from vitamin3d.dense.densification import CanvasPicture, Densifier, canvas_picture
 from vitamin3d.dense.depth_rendering import DepthRenderer
@@ -40,7 +40,7 @@ class Reconstruction:
         densification = config.densification
         self._densifier = Densifier(camera, self.renderer.canvas, densification)
         self._keyframes: NeighbourQueue[CanvasPicture] = NeighbourQueue(densification.reach, densification.keyframe_stride)
-        self._drawn: NeighbourQueue[DepthView] = NeighbourQueue(config.consistency.far if config.consistency.enabled else 0, 1)
+        self._drawn: NeighbourQueue[DepthView] = NeighbourQueue(config.consistency.reach if config.consistency.enabled else 0, 1)
         self.median_depths: list[float] = []
         self._waiting: list[DepthView] = []
         self.low: TsdfVolume | None = None
@@ -122,8 +122,8 @@ class Reconstruction:
         if not config.enabled:
             return around.item
         with self.times.timed("consistency"):
-            sides = (side[k - 1] for side in (around.before, around.after) for k in (config.near, config.far) if k <= len(side))
-            return doubted(around.item, list(sides), self.canvas, config.tolerance, config.contradicted_weight)
+            sides = (side[k - 1] for side in (around.before, around.after) for k in config.offsets if k <= len(side))
+            return voted(around.item, list(sides), self.canvas, config.tolerance, config.contradicted_weight)
 
     def depth_view(self, snapshot: MapSnapshot) -> DepthView | None:
         """Meshes, denoises and renders a keyframe; None where it has too few landmarks."""
