@@ -34,6 +34,7 @@ AT_LEAST_ONE = (
     "window.keyframes",
     "densification.keyframe_stride",
     "densification.reach",
+    "extrapolation.neighbours",
     "consistency.first",
     "consistency.spacing",
     "consistency.per_side",
@@ -367,6 +368,22 @@ class NltgvConfig:
 
 
 @dataclass(frozen=True)
+class ExtrapolationConfig:
+    """Vertices on the border of the picture, so that the mesh ends where the picture does; not in the paper."""
+
+    enabled: bool = True
+    spacing_px: float = 40.0
+    neighbours: int = 8
+    """The planes of so many vertices are continued."""
+    min_distance_px: float = 3.0
+    """To the nearest vertex."""
+    max_ratio: float = 2.0
+    """Between the inverse depth found and the lowest or highest of these vertices."""
+    doubling_px: float = 64.0
+    """Distance to the nearest vertex at which the deviation is twice theirs."""
+
+
+@dataclass(frozen=True)
 class DepthRenderingConfig:
     """Sec. 4.2: which triangles become depth."""
 
@@ -389,7 +406,7 @@ class ConsistencyConfig:
     """and the ones so many further,"""
     per_side: int = 3
     """together so many on each side."""
-    tolerance: float = 0.03
+    tolerance: float = 0.02
     """Relative difference of depth up to which a view confirms."""
     contradicted_weight: float = 0.1
     """Factor of a depth that more views contradict than confirm."""
@@ -420,7 +437,7 @@ class FusionConfig:
     keyframes_for_depth: int = 30
     """Keyframes whose depths decide the voxels; fusion waits for them where the voxels are not given."""
     truncation_voxels: float = 3.0
-    max_relative_deviation: float = 0.028
+    max_relative_deviation: float = 0.04
     """Pixels whose depth has a larger deviation, relative to the depth, are not fused (not of `blocks`)."""
     max_deviation_voxels: float = 4.5
     """The surface ends where all views together leave a larger deviation of the depth (`blocks` alone)."""
@@ -462,6 +479,7 @@ class Config:
     densification: DensificationConfig = field(default_factory=DensificationConfig)
     delaunay: DelaunayConfig = field(default_factory=DelaunayConfig)
     nltgv: NltgvConfig = field(default_factory=NltgvConfig)
+    extrapolation: ExtrapolationConfig = field(default_factory=ExtrapolationConfig)
     depth_rendering: DepthRenderingConfig = field(default_factory=DepthRenderingConfig)
     consistency: ConsistencyConfig = field(default_factory=ConsistencyConfig)
     fusion: FusionConfig = field(default_factory=FusionConfig)
@@ -480,6 +498,7 @@ def paper_config() -> Config:
         window=WindowConfig(anchors=0),
         final_adjustment=FinalAdjustmentConfig(enabled=False),
         densification=DensificationConfig(enabled=False),
+        extrapolation=ExtrapolationConfig(enabled=False),
         consistency=ConsistencyConfig(enabled=False),
         fusion=FusionConfig(max_relative_deviation=1e3),
         calibration=CalibrationConfig(refine="off"),

@@ -12,6 +12,7 @@ from vitamin3d.dense.consistency import voted
 from vitamin3d.dense.delaunay import triangulate
 from vitamin3d.dense.densification import CanvasPicture, Densifier, canvas_picture
 from vitamin3d.dense.depth_rendering import DepthRenderer
+from vitamin3d.dense.extrapolation import extended, outline
 from vitamin3d.dense.neighbour_queue import Around, NeighbourQueue
 from vitamin3d.dense.nltgv import denoise
 from vitamin3d.dense.surface_extraction import clean
@@ -37,6 +38,7 @@ class Reconstruction:
         self.config = config
         self.times = times if times is not None else StepTimes()
         self.renderer = DepthRenderer(camera, config.depth_rendering)
+        self._border = outline(camera, config.extrapolation.spacing_px)
         densification = config.densification
         self._densifier = Densifier(camera, self.renderer.canvas, densification)
         self._keyframes: NeighbourQueue[CanvasPicture] = NeighbourQueue(densification.reach, densification.keyframe_stride)
@@ -133,8 +135,12 @@ class Reconstruction:
             return None
         with self.times.timed("denoising"):
             denoised = denoise(mesh, self.config.nltgv)
+        mesh, slopes = denoised.mesh, denoised.slopes
+        if self.config.extrapolation.enabled:
+            with self.times.timed("extrapolation"):
+                mesh, slopes = extended(mesh, slopes, self._border, self.config.extrapolation)
         with self.times.timed("rendering"):
-            return self.renderer.render(snapshot, denoised.mesh, denoised.slopes)
+            return self.renderer.render(snapshot, mesh, slopes)
 
     def fuse(self, view: DepthView) -> None:
         """Integrates a view into both volumes, as soon as the voxels can be chosen."""

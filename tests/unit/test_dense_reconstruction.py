@@ -59,7 +59,7 @@ def test_all_steps_are_timed():
     reconstruction, _ = run(count=2)
     reconstruction.surfaces()
     counts = {step: len(times) for step, times in reconstruction.times.milliseconds.items()}
-    each = dict.fromkeys(("meshing", "denoising", "rendering", "consistency", "fusion_low", "fusion_high"), 2)
+    each = dict.fromkeys(("meshing", "denoising", "extrapolation", "rendering", "consistency", "fusion_low", "fusion_high"), 2)
     assert counts == {**each, "surface_low": 1, "surface_high": 1}
 
 
