@@ -12,10 +12,11 @@ from pathlib import Path
 import cv2
 import numpy as np
 
-from vitamin3d.datasets import Unreadable, open_dataset
+from vitamin3d.datasets import open_dataset
 from vitamin3d.datasets.calibration import read_calibration
 from vitamin3d.datasets.trajectories import read_tum
-from vitamin3d.errors import InputError, Vitamin3dError
+from vitamin3d.errors import Vitamin3dError
+from vitamin3d.evaluation.paper_figure import tracked_extrema
 from vitamin3d.exporters.files import write_file
 from vitamin3d.exporters.mesh import read_ply
 from vitamin3d.exporters.normal_map import NormalCaster
@@ -23,7 +24,7 @@ from vitamin3d.exporters.rendering import draw, stepped_aside, viewer
 from vitamin3d.geometry.se3 import inverse
 from vitamin3d.types import Array
 
-TRACK_COLOR, GAP = (80, 255, 80), 6
+GAP = 6
 JPEG_QUALITY = 90
 
 
@@ -41,24 +42,6 @@ def parsed(argv: list[str] | None) -> argparse.Namespace:
     return parser.parse_args(argv)
 
 
-def tracked_extrema(arguments: argparse.Namespace, timestamp_ns: int) -> Array:
-    """The frame (H, W, 3) RGB with its tracked extrema as dots."""
-    dataset = open_dataset(arguments.source, arguments.calibration)
-    index = int(np.argmin(np.abs(dataset.timestamps_ns - timestamp_ns)))
-    frame = dataset.read(index)
-    if isinstance(frame, Unreadable) or not (arguments.out / "tracks.npz").exists():
-        raise InputError(f"{arguments.out}: no tracks.npz, or no picture for it; reconstruct with --save-tracks")
-    tracks = np.load(arguments.out / "tracks.npz")
-    picture = np.repeat(frame.image[..., None], 3, axis=2) if frame.color is None else frame.color.copy()
-    if arguments.without_picture:
-        picture[:] = 0
-    scale = max(1, round(2 * arguments.width / picture.shape[1]))
-    picture = cv2.resize(picture, None, fx=scale, fy=scale, interpolation=cv2.INTER_CUBIC)
-    for u, v in (tracks["pixel"][tracks["frame_index"] == index] + 0.5) * scale - 0.5:
-        cv2.circle(picture, (round(float(u)), round(float(v))), scale, TRACK_COLOR, -1, cv2.LINE_AA)
-    return np.asarray(picture)
-
-
 def panels(arguments: argparse.Namespace) -> list[Array]:
     """Extrema, coloured mesh, normals of the fine and of the coarse mesh; each (H, W, 3) RGB of one size."""
     keyframes = read_tum(arguments.out / "keyframes.tum")
@@ -69,13 +52,14 @@ def panels(arguments: argparse.Namespace) -> list[Array]:
     T_view = stepped_aside(T_cam_world, depth, 0.0, arguments.up * depth, arguments.back * depth)
     double = viewer(canvas, 2 * arguments.width)
     size = (arguments.width, double.height // 2)
+    dataset, time = open_dataset(arguments.source, arguments.calibration), int(keyframes.timestamps_ns[arguments.keyframe])
+    extrema = tracked_extrema(arguments.out, dataset, time, size, not arguments.without_picture)
     drawn = [
-        tracked_extrema(arguments, int(keyframes.timestamps_ns[arguments.keyframe])),
         draw(fine, double, T_view, "color"),
         draw(fine, double, T_view, "normals"),
         draw(coarse, double, T_view, "normals"),
     ]
-    return [np.asarray(cv2.resize(panel, size, interpolation=cv2.INTER_AREA)) for panel in drawn]
+    return [extrema, *(np.asarray(cv2.resize(panel, size, interpolation=cv2.INTER_AREA)) for panel in drawn)]
 
 
 def page(four: list[Array]) -> Array:

@@ -8,6 +8,7 @@ import typer
 from vitamin3d.commands.benchmark import benchmark
 from vitamin3d.commands.compare import compare
 from vitamin3d.commands.evaluate import evaluate
+from vitamin3d.commands.figures import figures
 from vitamin3d.commands.process import EXIT_BROKEN, EXIT_ERROR
 from vitamin3d.commands.reconstruct import reconstruct, show_config
 from vitamin3d.commands.warmup import warmup
@@ -24,6 +25,7 @@ def _vitamin3d() -> None:
 app.command()(reconstruct)
 app.command()(evaluate)
 app.command()(compare)
+app.command()(figures)
 app.command()(benchmark)
 app.command()(warmup)
 app.command("config")(show_config)

@@ -120,9 +120,16 @@ def compare(own: list[Item], others: list[Item], truth: Truth | None, reference:
     Raises:
         InputError: our own run cannot be placed.
     """
+    placed = placed_together(own, others, truth, reference)
+    ours = placed[len(own) - 1].samples
+    reports = [_measured(p, ours, reference, is_own=k < len(own)) for k, p in enumerate(placed)]
+    return {"world": "ground truth" if truth is not None else "our run", "items": reports}, placed
+
+
+def placed_together(own: list[Item], others: list[Item], truth: Truth | None, reference: Array | None) -> list[Placed]:
+    """All items in one world, ours first; see `compare`."""
     world = truth.trajectory if truth is not None else own[0].trajectory
     placed = [place(item, by_trajectory(item, truth, world), reference) for item in own]
-    ours = placed[-1].samples
     for item in others:
         placement = (
             by_trajectory(item, truth, world)
@@ -130,8 +137,7 @@ def compare(own: list[Item], others: list[Item], truth: Truth | None, reference:
             else _by_registration(item, placed[: len(own)])
         )
         placed.append(place(item, placement, reference))
-    reports = [_measured(p, ours, reference, is_own=k < len(own)) for k, p in enumerate(placed)]
-    return {"world": "ground truth" if truth is not None else "our run", "items": reports}, placed
+    return placed
 
 
 def by_trajectory(item: Item, truth: Truth | None, world: Trajectory | None) -> Placement:

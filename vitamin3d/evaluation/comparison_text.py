@@ -10,7 +10,7 @@ from vitamin3d.datasets.calibration import read_calibration
 from vitamin3d.datasets.trajectories import read_tum
 from vitamin3d.evaluation.comparison import Placed
 from vitamin3d.exporters.normal_map import NormalCaster
-from vitamin3d.exporters.rendering import draw, draw_points, side_by_side, stepped_aside, viewer
+from vitamin3d.exporters.rendering import draw, draw_points, reduced, side_by_side, stepped_aside, viewer
 from vitamin3d.geometry.camera import Camera
 from vitamin3d.geometry.se3 import inverse, transform_points
 from vitamin3d.types import Array, Surface
@@ -118,8 +118,7 @@ def _panel(placed: Placed, camera: Camera, T_view: Array) -> Array:
         large = draw(NormalCaster(_surface(placed)), camera, T_view, "normals")
     else:
         large = draw_points(placed.geometry.points, None, camera, T_view, 1.0 * SUPERSAMPLING)
-    shape = (camera.height // SUPERSAMPLING, SUPERSAMPLING, camera.width // SUPERSAMPLING, SUPERSAMPLING, 3)
-    return np.asarray(large[: shape[0] * SUPERSAMPLING, : shape[2] * SUPERSAMPLING].reshape(shape).mean(axis=(1, 3)).astype(np.uint8))
+    return reduced(large, SUPERSAMPLING)
 
 
 def _surface(placed: Placed) -> Surface:

@@ -80,6 +80,13 @@ def _tints(depth: Array) -> Array:
     return np.asarray((1 - share) * NEAR_COLOR + share * FAR_COLOR)
 
 
+def reduced(picture: Array, factor: int) -> Array:
+    """A picture (H, W, 3) uint8 made smaller by averaging blocks of `factor`² pixels."""
+    height, width = (n // factor for n in picture.shape[:2])
+    blocks = picture[: height * factor, : width * factor].reshape(height, factor, width, factor, 3)
+    return np.asarray(blocks.mean(axis=(1, 3)).astype(np.uint8))
+
+
 def side_by_side(panels: Sequence[Array], labels: Sequence[str], columns: int = 3) -> Array:
     """Panels (H, W, 3) of one size with their labels above, row by row, white between."""
     height, width = panels[0].shape[:2]
