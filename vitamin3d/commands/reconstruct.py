@@ -150,15 +150,22 @@ def _conclude(outcome: "Outcome", out: Path) -> int:
     if stats["live"]:
         typer.echo(_live_line(stats["live"]))
     if stats["calibration"]["refined"]:
-        given, used = stats["calibration"]["given"], stats["calibration"]["used"]
-        typer.echo(
-            f"calibration refined: fx {given['fx']:.1f} to {used['fx']:.1f} px, k1 {given['k1']:.4f} to {used['k1']:.4f}; "
-            f"see {out / 'calibration.yaml'}"
-        )
+        typer.echo(_calibration_line(stats["calibration"]["given"], stats["calibration"]["used"], out / "calibration.yaml"))
     for name in ("mesh_high.ply", "mesh_high.obj", "mesh_low.ply", "cloud.ply", "trajectory.tum"):
         if (out / name).exists():
             typer.echo(f"  {out / name}")
     return EXIT_INTERRUPTED if outcome.record.interrupted else 0
+
+
+def _calibration_line(given: dict[str, float], used: dict[str, float], path: Path) -> str:
+    """What was refined of the camera."""
+    changes = (("fx", "{:.1f}", 1.0, " px"), ("k1", "{:.4f}", 1.0, ""), ("readout_s", "{:.1f}", 1e3, " ms"))
+    parts = [
+        f"{name.removesuffix('_s')} {form.format(factor * given[name])} to {form.format(factor * used[name])}{unit}"
+        for name, form, factor, unit in changes
+        if used[name] != given[name]
+    ]
+    return f"calibration refined: {', '.join(parts)}; see {path}"
 
 
 def _live_line(live: dict[str, Any]) -> str:
