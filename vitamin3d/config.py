@@ -98,7 +98,7 @@ class ExtremaTrackingConfig:
 class InitializationConfig:
     """Sec. 5.1: when two frames become the first map."""
 
-    min_motion_px: float = 25.0
+    min_motion_px: float = 18.0
     min_parallax_deg: float = 0.6
     """Median over the triangulated points."""
     ransac_threshold_px: float = 1.0

@@ -66,9 +66,9 @@ class InitializationHistory:
         return a.tracks.ids[rows_a], a.ideal_pixels[rows_a], b.ideal_pixels[rows_b]
 
     def is_worth_a_try(self, pixels_0: Array, pixels_1: Array) -> bool:
-        """After a failed try, only with a fifth more motion than then."""
+        """After a failed try, only with a twentieth more motion than then."""
         motion = median_motion(pixels_0, pixels_1)
-        if self._tried_motion and motion < 1.2 * self._tried_motion:
+        if self._tried_motion and motion < 1.05 * self._tried_motion:
             return False
         self._tried_motion = motion if motion >= self.config.min_motion_px else 0.0
         return True
