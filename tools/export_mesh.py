@@ -5,12 +5,13 @@
     python tools/export_mesh.py OUT --mesh low --format obj --simplify 50000 --output small.obj
 
 PLY and OBJ keep the map's frame (that of the first camera: x right, y down, z forward). GLB is turned upright, y up, as
-glTF wants it. `--simplify` uses pymeshlab, which is under the GPL and is imported for this option only.
+glTF wants it. `--simplify` and `--fill-holes` use pymeshlab, which is under the GPL and is imported for these options only.
 """
 
 import argparse
 import sys
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
@@ -28,6 +29,7 @@ def parsed(argv: list[str] | None) -> argparse.Namespace:
     parser.add_argument("--mesh", choices=("low", "high"), default="high")
     parser.add_argument("--format", choices=("ply", "obj", "glb"), help="default: the ending of --output, else ply")
     parser.add_argument("--simplify", type=int, metavar="N", help="at most N triangles (quadric edge collapse)")
+    parser.add_argument("--fill-holes", type=int, metavar="N", help="closes holes with at most N edges around them")
     parser.add_argument("--output", type=Path, help="default: mesh_<mesh>_export.<format> in OUT")
     return parser.parse_args(argv)
 
@@ -37,6 +39,8 @@ def export(arguments: argparse.Namespace) -> Path:
     surface = read_ply(arguments.out / f"mesh_{arguments.mesh}.ply")
     path, kind = _target(arguments)
     comments = [f"vitamin3d: {arguments.mesh} mesh, {len(surface.triangles)} triangles before export"]
+    if arguments.fill_holes is not None:
+        surface = filled(surface, arguments.fill_holes)
     if arguments.simplify is not None:
         surface = simplified(surface, arguments.simplify)
     {"ply": write_ply, "obj": write_obj, "glb": write_glb}[kind](surface, path, comments)
@@ -57,22 +61,43 @@ def simplified(surface: Surface, max_triangles: int) -> Surface:
         raise InputError(f"--simplify: must be positive, not {max_triangles}")
     if len(surface.triangles) <= max_triangles:
         return surface
-    pymeshlab = _pymeshlab()
+    meshes = _mesh_set(surface, "--simplify")
+    meshes.meshing_decimation_quadric_edge_collapse(targetfacenum=max_triangles, preservenormal=True, preserveboundary=True)
+    return _surface(meshes)
+
+
+def filled(surface: Surface, max_edges: int) -> Surface:
+    """The surface with its holes of at most so many edges closed; edges that more than two triangles share are cut before."""
+    if max_edges < 3:
+        raise InputError(f"--fill-holes {max_edges}: a hole has at least 3 edges")
+    meshes = _mesh_set(surface, "--fill-holes")
+    meshes.meshing_repair_non_manifold_edges()
+    meshes.meshing_repair_non_manifold_vertices()
+    meshes.meshing_close_holes(maxholesize=max_edges)
+    return _surface(meshes)
+
+
+def _mesh_set(surface: Surface, option: str) -> Any:
+    """The surface as pymeshlab has it."""
+    pymeshlab = _pymeshlab(option)
     rgba = np.column_stack([surface.colors / 255.0, np.ones(len(surface.colors))])
     meshes = pymeshlab.MeshSet()
     meshes.add_mesh(pymeshlab.Mesh(surface.vertices_world, surface.triangles, v_color_matrix=rgba))
-    meshes.meshing_decimation_quadric_edge_collapse(targetfacenum=max_triangles, preservenormal=True, preserveboundary=True)
+    return meshes
+
+
+def _surface(meshes: Any) -> Surface:
     mesh = meshes.current_mesh()
     vertices, triangles = np.array(mesh.vertex_matrix()), np.array(mesh.face_matrix(), np.int32)
     colors = np.rint(255.0 * mesh.vertex_color_matrix()[:, :3]).astype(np.uint8)
     return Surface(vertices, triangles, vertex_normals(vertices, triangles), colors)
 
 
-def _pymeshlab():  # type: ignore[no-untyped-def]
+def _pymeshlab(option: str):  # type: ignore[no-untyped-def]
     try:
         import pymeshlab
     except ImportError as error:
-        raise DependencyError(f"--simplify needs pymeshlab ({error}); `pip install pymeshlab`") from None
+        raise DependencyError(f"{option} needs pymeshlab ({error}); `pip install pymeshlab`") from None
     return pymeshlab
 
 

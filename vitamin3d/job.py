@@ -289,7 +289,8 @@ class _Dense:
         if is_broken:
             self.reconstruction.forget_waiting()
         if self.reconstruction.median_depths:
-            self.output.write_surfaces(*self.reconstruction.surfaces(), self.scale, self.reconstruction.voxel_lengths())
+            dense = self.reconstruction
+            self.output.write_surfaces(*dense.surfaces(), self.scale, dense.voxel_lengths(), dense.filter_remark)
 
     def voxels(self) -> dict[str, float] | None:
         """Sides of the voxels in the unit of the output."""

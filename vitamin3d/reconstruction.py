@@ -159,6 +159,12 @@ class Reconstruction:
             high = self._surface(self.high)
         return low, high
 
+    @property
+    def filter_remark(self) -> str:
+        """What is not in the surfaces, for the comments of their files."""
+        fusion, pieces = self.config.fusion, f"pieces of fewer than {self.config.surface.min_component_triangles} fine triangles removed"
+        return pieces if fusion.backend == "blocks" else f"depths of a relative deviation up to {fusion.max_relative_deviation:g}; {pieces}"
+
     def voxel_lengths(self) -> tuple[float, float]:
         """Sides of the coarse and the fine voxels in map units: as configured, or fractions of the scene's median depth."""
         fusion = self.config.fusion

@@ -65,6 +65,20 @@ def test_simplified_meshes_keep_shape_and_colour(run):
     assert (small.normals_world[:, 2] < 0).all()
 
 
+def test_small_holes_are_closed_and_the_rim_stays(run):
+    pytest.importorskip("pymeshlab")
+    whole = read_ply(run / "mesh_high.ply")
+    centers = whole.vertices_world[whole.triangles].mean(axis=1)[:, :2]
+    torn = Surface(whole.vertices_world, whole.triangles[np.abs(centers).max(axis=1) > 0.11], whole.normals_world, whole.colors)
+    write_ply(torn, run / "mesh_high.ply", [])
+    assert tool("export_mesh").main([str(run), "--fill-holes", "30", "--output", str(run / "filled.ply")]) == 0
+    mended = read_ply(run / "filled.ply")
+    assert len(torn.triangles) < len(mended.triangles) <= len(whole.triangles)
+    middle = np.abs(mended.vertices_world[mended.triangles].mean(axis=1)[:, :2]).max(axis=1) < 0.08
+    assert middle.any() and np.abs(mended.vertices_world[:, :2]).max() == pytest.approx(1.0)
+    assert tool("export_mesh").main([str(run), "--fill-holes", "2"]) == 2
+
+
 @pytest.mark.parametrize("frame", ["camera", "world"])
 def test_normal_maps_of_every_second_keyframe(run, frame):
     assert tool("export_normal_maps").main([str(run), "--every", "2", "--frame", frame, "--mesh", "low"]) == 0

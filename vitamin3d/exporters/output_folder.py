@@ -4,6 +4,7 @@
 import io
 import json
 import shutil
+from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
 from typing import Any
 
@@ -38,6 +39,14 @@ FOLDERS = ("normals", "depth", "evaluation", "comparison")
 DEPTH_COUNTS_PER_METRE = 1000.0
 DEPTH_COUNTS_PER_UNIT = 5000.0
 PROGRAM = "vitamin3d"
+
+
+def _program() -> str:
+    """Name and version, where it is installed."""
+    try:
+        return f"{PROGRAM} {version(PROGRAM)}"
+    except PackageNotFoundError:
+        return PROGRAM
 
 
 def _camera_yaml(camera: Camera) -> str:
@@ -107,12 +116,13 @@ class OutputFolder:
 
     def write_cloud(self, cloud: PointCloud, scale: Scale, filter_remark: str) -> None:
         """`cloud.ply`."""
-        write_cloud_ply(scale.cloud(cloud), self.path / "cloud.ply", [PROGRAM, scale.remark, filter_remark])
+        write_cloud_ply(scale.cloud(cloud), self.path / "cloud.ply", [_program(), scale.remark, filter_remark])
 
-    def write_surfaces(self, low: Surface, high: Surface, scale: Scale, voxels: tuple[float, float]) -> None:
+    def write_surfaces(self, low: Surface, high: Surface, scale: Scale, voxels: tuple[float, float], filter_remark: str = "") -> None:
         """`mesh_low.ply`, `mesh_high.ply` and `mesh_high.obj`; voxels in map units."""
         for name, surface, voxel in (("mesh_low", low, voxels[0]), ("mesh_high", high, voxels[1])):
-            comments = [PROGRAM, scale.remark, f"TSDF voxels of {voxel * scale.metres_per_unit:.6g} {scale.unit}"]
+            comments = [_program(), scale.remark, f"TSDF voxels of {voxel * scale.metres_per_unit:.6g} {scale.unit}", filter_remark]
+            comments = [comment for comment in comments if comment]
             scaled = scale.surface(surface)
             write_ply(scaled, self.path / f"{name}.ply", comments)
             if name == "mesh_high":
