@@ -134,3 +134,10 @@ def test_a_filter_that_leaves_nothing_and_foreign_clouds_are_refused(cloud, run,
     assert "not a cloud that vitamin3d wrote" in capsys.readouterr().err
     assert filter_cloud.main([str(tmp_path / "none.ply"), str(tmp_path / "good.ply")]) == 2
     assert not (tmp_path / "good.ply").exists()
+
+
+def test_the_speed_of_nltgv_is_told_with_the_energy(capsys):
+    assert tool("benchmark_nltgv").main(["--vertices", "400", "--iterations", "300"]) == 0
+    words = capsys.readouterr().out.split()
+    assert words[0] == "400" and 1100 < int(words[2]) < 1200
+    assert float(words[4]) > 100 and float(words[-1]) < float(words[-3])
