@@ -150,6 +150,8 @@ class _JobRun:
         with suppress(Exception):
             cloud_points = _write_sparse(self.slam, self.dense.scale, self.output, self.job)
         with suppress(Exception):
+            self.dense.finish()
+        with suppress(Exception):
             self.dense.write_surfaces(is_broken=True)
         with suppress(Exception):
             self._conclude(cloud_points, failure)
