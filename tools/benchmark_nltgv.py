@@ -43,9 +43,8 @@ def main(argv: list[str] | None = None) -> int:
     state = solve(problem, start, arguments.iterations)
     rate = arguments.iterations / (time.process_time() - before)
     energies = objective(problem, start), objective(problem, state)
-    print(
-        f"{len(mesh.pixels)} vertices, {len(mesh.edges)} edges: {rate:.0f} iterations per CPU second, energy {energies[0]:.4g} to {energies[1]:.4g}"
-    )
+    size = f"{len(mesh.pixels)} vertices, {len(mesh.edges)} edges"
+    print(f"{size}: {rate:.0f} iterations per CPU second, energy {energies[0]:.4g} to {energies[1]:.4g}")
     return 0
 
 

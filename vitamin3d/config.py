@@ -423,6 +423,27 @@ class ConsistencyConfig:
 
 
 @dataclass(frozen=True)
+class PhotometricConfig:
+    """Before fusion, triangles that may be webs over free space must look alike in the pictures of the voters.
+
+    Off: after the votes it finds nothing more that is wrong (docs/dense.md).
+    """
+
+    enabled: bool = False
+    min_inverse_depth_range: float = 0.05
+    """A triangle is doubtful where its inverse depths differ by more, relative to their mean,"""
+    min_edge_px: float = 40.0
+    """or where its longest edge is longer."""
+    tolerance: float = 0.05
+    """What is nearer than a pixel by this share of its depth hides it."""
+    min_pixels: int = 25
+    min_contrast: float = 3.0
+    """Grey levels; nothing is said about flatter triangles."""
+    min_correlation: float = 0.4
+    """Of the second best voter."""
+
+
+@dataclass(frozen=True)
 class FusionConfig:
     """Sec. 4.2: the two TSDF volumes."""
 
@@ -482,6 +503,7 @@ class Config:
     extrapolation: ExtrapolationConfig = field(default_factory=ExtrapolationConfig)
     depth_rendering: DepthRenderingConfig = field(default_factory=DepthRenderingConfig)
     consistency: ConsistencyConfig = field(default_factory=ConsistencyConfig)
+    photometric: PhotometricConfig = field(default_factory=PhotometricConfig)
     fusion: FusionConfig = field(default_factory=FusionConfig)
     surface: SurfaceConfig = field(default_factory=SurfaceConfig)
 

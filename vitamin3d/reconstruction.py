@@ -15,6 +15,7 @@ from vitamin3d.dense.depth_rendering import DepthRenderer
 from vitamin3d.dense.extrapolation import extended, outline
 from vitamin3d.dense.neighbour_queue import Around, NeighbourQueue
 from vitamin3d.dense.nltgv import denoise
+from vitamin3d.dense.photometric_check import marked, photometrically_checked
 from vitamin3d.dense.surface_extraction import clean
 from vitamin3d.dense.tsdf_fusion import Limits, TsdfVolume, empty_surface
 from vitamin3d.geometry.camera import Camera
@@ -42,7 +43,7 @@ class Reconstruction:
         densification = config.densification
         self._densifier = Densifier(camera, self.renderer.canvas, densification)
         self._keyframes: NeighbourQueue[CanvasPicture] = NeighbourQueue(densification.reach, densification.keyframe_stride)
-        self._drawn: NeighbourQueue[DepthView] = NeighbourQueue(config.consistency.reach if config.consistency.enabled else 0, 1)
+        self._drawn: NeighbourQueue[DepthView] = NeighbourQueue(config.consistency.reach if self._is_checked else 0, 1)
         self.median_depths: list[float] = []
         self._waiting: list[DepthView] = []
         self.low: TsdfVolume | None = None
@@ -120,12 +121,20 @@ class Reconstruction:
             return self._densifier.densify(around)
 
     def _checked(self, around: Around[DepthView]) -> DepthView:
-        config = self.config.consistency
-        if not config.enabled:
-            return around.item
-        with self.times.timed("consistency"):
-            sides = (side[k - 1] for side in (around.before, around.after) for k in config.offsets if k <= len(side))
-            return voted(around.item, list(sides), self.canvas, config.tolerance, config.contradicted_weight)
+        consistency, photometric, view = self.config.consistency, self.config.photometric, around.item
+        voters = [side[k - 1] for side in (around.before, around.after) for k in consistency.offsets if k <= len(side)]
+        if consistency.enabled:
+            with self.times.timed("consistency"):
+                view = voted(view, voters, self.canvas, consistency.tolerance, consistency.contradicted_weight)
+        if photometric.enabled:
+            with self.times.timed("photometric_check"):
+                view = photometrically_checked(view, voters, self.canvas, self.renderer.is_outside, photometric)
+        return view
+
+    @property
+    def _is_checked(self) -> bool:
+        """Whether views wait for those around them."""
+        return self.config.consistency.enabled or self.config.photometric.enabled
 
     def depth_view(self, snapshot: MapSnapshot) -> DepthView | None:
         """Meshes, denoises and renders a keyframe; None where it has too few landmarks."""
@@ -140,7 +149,9 @@ class Reconstruction:
             with self.times.timed("extrapolation"):
                 mesh, slopes = extended(mesh, slopes, self._border, self.config.extrapolation)
         with self.times.timed("rendering"):
-            return self.renderer.render(snapshot, mesh, slopes)
+            view = self.renderer.render(snapshot, mesh, slopes)
+        photometric = self.config.photometric
+        return marked(view, mesh, self.renderer, photometric) if photometric.enabled else view
 
     def fuse(self, view: DepthView) -> None:
         """Integrates a view into both volumes, as soon as the voxels can be chosen."""

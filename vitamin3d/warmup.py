@@ -74,7 +74,9 @@ def warm_up(configs: list[Config] | None = None, tell: Tell | None = None) -> No
 def _everything(config: Config) -> Config:
     """The settings with what they leave out switched on."""
     calibration = dataclasses.replace(config.calibration, refine="on", first_keyframes=8)
-    return dataclasses.replace(config, calibration=calibration, recovery=dataclasses.replace(config.recovery, merge_distance=0.02))
+    recovery = dataclasses.replace(config.recovery, merge_distance=0.02)
+    photometric = dataclasses.replace(config.photometric, enabled=True)
+    return dataclasses.replace(config, calibration=calibration, recovery=recovery, photometric=photometric)
 
 
 def _tracked(frames: list[Frame], config: Config) -> Slam:

@@ -5,7 +5,7 @@ import numpy as np
 import pytest
 import reference_dense as reference
 
-from vitamin3d.config import Config, DelaunayConfig, DensificationConfig, FusionConfig, NltgvConfig, SurfaceConfig
+from vitamin3d.config import Config, DelaunayConfig, DensificationConfig, FusionConfig, NltgvConfig, PhotometricConfig, SurfaceConfig
 from vitamin3d.geometry.se3 import exp_se3, inverse
 from vitamin3d.reconstruction import Reconstruction
 from vitamin3d.types import StepTimes
@@ -61,6 +61,22 @@ def test_all_steps_are_timed():
     counts = {step: len(times) for step, times in reconstruction.times.milliseconds.items()}
     each = dict.fromkeys(("meshing", "denoising", "extrapolation", "rendering", "consistency", "fusion_low", "fusion_high"), 2)
     assert counts == {**each, "surface_low": 1, "surface_high": 1}
+
+
+def test_what_pictures_contradict_is_not_fused():
+    """All pictures of these keyframes are flat or noise that no depth explains."""
+    photometric = PhotometricConfig(enabled=True, min_inverse_depth_range=0.0)
+    kept, dropped = (run(dataclasses.replace(CONFIG, photometric=p), landmarks=120)[1] for p in (PhotometricConfig(), photometric))
+    assert [(view.depth > 0).sum() for view in kept] == [(view.depth > 0).sum() for view in dropped]  # flat: nothing is said
+    noise = (noisy(snapshot, k) for k, snapshot in enumerate(snapshots(landmarks=120)))
+    views = list(Reconstruction(reference.SMALL, dataclasses.replace(CONFIG, photometric=photometric)).depth_views(noise))
+    assert len(views) == 4
+    assert sum((view.depth > 0).sum() for view in views) < 0.8 * sum((view.depth > 0).sum() for view in kept)
+
+
+def noisy(snapshot, seed):
+    image = np.random.default_rng(seed).integers(0, 255, snapshot.frame.image.shape).astype(np.uint8)
+    return dataclasses.replace(snapshot, frame=dataclasses.replace(snapshot.frame, image=image))
 
 
 def test_keyframes_without_landmarks_are_passed_over():
