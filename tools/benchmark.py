@@ -3,7 +3,7 @@
 
     python tools/benchmark.py SEQUENCE                           # default settings; CPU milliseconds: median and 95th percentile
     python tools/benchmark.py SEQUENCE --live --json new.json --against old.json
-    python tools/benchmark.py SEQUENCE --loop 20000              # back and forth: does memory level off?
+    python tools/benchmark.py SEQUENCE --loop 20000 --dense      # back and forth: does memory level off?
 
 The steps run one after the other on one thread and are timed by that thread's CPU, so that other load on the machine
 matters little; the processor's caches it still shares. The sparse half runs first (its scale from the ground truth, where
@@ -20,7 +20,6 @@ import resource
 import sys
 import time
 from collections.abc import Callable
-from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -52,6 +51,10 @@ from vitamin3d.warmup import warm_up
 SCHUR_INTERVAL = 10
 MEMORY_INTERVAL = 250
 KLT, SCHUR, DECODING = "OpenCV KLT, as many points", "Schur complement, same window", "decoding"
+
+
+Telling = Callable[[int, Slam, list[tuple[int, Frame]]], None]
+"""Hears of each frame: how many are done, and the keyframes that settled."""
 
 
 class Looped:
@@ -102,7 +105,7 @@ class Measured:
     dense_seconds: float = 0.0
 
 
-def run_sparse(dataset: Dataset | Looped, frames: int, config: Config, with_rivals: bool, tell: Callable[[int, Slam], None]) -> Measured:
+def run_sparse(dataset: Dataset | Looped, frames: int, config: Config, with_rivals: bool, tell: Telling) -> Measured:
     """The sparse half, step by step; KLT and Schur in between where wanted."""
     cv2.setNumThreads(1)
     others = StepTimes(clock=time.thread_time)
@@ -119,10 +122,10 @@ def run_sparse(dataset: Dataset | Looped, frames: int, config: Config, with_riva
             others.add(KLT, klt_milliseconds(previous.image, frame.image, points, time.thread_time) / 1e3)
         begun = time.thread_time()
         made.slam.process_frame(made.front_end.process(frame))
-        made.slam.take_settled_keyframes()
+        settled = made.slam.take_settled_keyframes()
         made.sparse_seconds += time.thread_time() - begun
         made.live_points.append(int((made.slam.tracks.missed == 0).sum()))
-        tell(index + 1, made.slam)
+        tell(index + 1, made.slam, settled)
         previous = frame
     begun = time.thread_time()
     made.slam.finish()
@@ -151,7 +154,7 @@ def benchmark(dataset: Dataset, frames: int | None, config: Config) -> dict[str,
     """All figures as a JSON object."""
     warm_up([config])
     count = min(len(dataset), frames or len(dataset))
-    made = run_sparse(dataset, count, config, True, lambda done, slam: None)
+    made = run_sparse(dataset, count, config, True, lambda done, slam, settled: None)
     if made.slam.map.num_keyframes == 0:
         raise InputError(f"{dataset.name}: no map: {made.slam.initialization_reason}")
     has_truth = dataset.ground_truth() is not None
@@ -220,11 +223,14 @@ def processor() -> str:
 # --- a run without end ---------------------------------------------------------------------------------------------
 
 
-def loop(dataset: Dataset, frames: int, config: Config) -> dict[str, Any]:
-    """Memory and the size of the map in the course of a long run of the sparse half."""
+def loop(dataset: Dataset, frames: int, config: Config, with_dense: bool = False) -> dict[str, Any]:
+    """Memory and the size of the map in the course of a long run of the sparse half, or of both."""
     course: list[dict[str, float]] = []
+    reconstruction = Reconstruction(dataset.camera, config)
 
-    def tell(done: int, slam: Slam) -> None:
+    def tell(done: int, slam: Slam, settled: list[tuple[int, Frame]]) -> None:
+        for keyframe, frame in settled if with_dense else []:
+            reconstruction.add_keyframe(slam.snapshot(keyframe, frame))
         if done % MEMORY_INTERVAL == 0 or done == frames:
             landmarks = int(np.isfinite(slam.map.points_world[:, 0]).sum())
             course.append(
@@ -235,6 +241,7 @@ def loop(dataset: Dataset, frames: int, config: Config) -> dict[str, Any]:
                     "landmarks": landmarks,
                     "observations": len(slam.map.obs_landmark),
                     "tracked": len(slam.poses),
+                    "views": len(reconstruction.median_depths),
                     "cpu_seconds": round(time.process_time(), 1),
                 }
             )
@@ -244,7 +251,9 @@ def loop(dataset: Dataset, frames: int, config: Config) -> dict[str, Any]:
     warm_up([config])
     made = run_sparse(Looped(dataset, frames), frames, config, False, tell)
     tracked = len(made.slam.poses) / frames
-    return {"source": dataset.name, "frames": frames, "tracked": tracked, "course": course, "peak_memory_mb": peak_memory_mb()}
+    triangles = [len(surface.triangles) for surface in reconstruction.surfaces()] if with_dense else []
+    figures = {"source": dataset.name, "frames": frames, "tracked": tracked, "triangles": triangles, "course": course}
+    return figures | {"peak_memory_mb": peak_memory_mb(), "versions": versions()}
 
 
 def loop_plot(figures: dict[str, Any]) -> str:
@@ -304,7 +313,8 @@ def parsed(argv: list[str] | None) -> argparse.Namespace:
     parser.add_argument("--mode", choices=("default", "paper"), default="default")
     parser.add_argument("--live", action="store_true", help="the settings of --live")
     parser.add_argument("--config", type=Path, help="settings as TOML")
-    parser.add_argument("--loop", type=int, metavar="N", help="only the sparse half, N frames back and forth: the course of memory")
+    parser.add_argument("--loop", type=int, metavar="N", help="N frames back and forth: the course of memory")
+    parser.add_argument("--dense", action="store_true", help="of --loop: mesh and fuse as well")
     parser.add_argument("--plot", type=Path, metavar="SVG", help="of --loop")
     parser.add_argument("--json", type=Path, metavar="FILE", help="write all figures there")
     parser.add_argument("--against", type=Path, metavar="FILE", help="compare with an earlier --json")
@@ -332,8 +342,8 @@ def main(argv: list[str] | None = None) -> int:
         dataset = open_dataset(arguments.source, arguments.calibration)
         if min(arguments.loop or 2, arguments.frames or 2) < 2:
             raise InputError("--frames and --loop: at least 2")
-        measure = partial(loop, frames=arguments.loop) if arguments.loop else partial(benchmark, frames=arguments.frames)
-        figures = measure(dataset, config=config)
+        frames = arguments.loop or arguments.frames
+        figures = loop(dataset, frames, config, arguments.dense) if arguments.loop else benchmark(dataset, frames, config)
         if arguments.plot and arguments.loop:
             write_file(arguments.plot, [loop_plot(figures).encode()])
         if arguments.json:

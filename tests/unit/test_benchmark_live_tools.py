@@ -9,6 +9,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from vitamin3d.config import Config, live_config
+
 sys.path.insert(0, str(Path(__file__).parents[2] / "tools"))
 import benchmark
 import benchmark_scaling
@@ -67,6 +69,12 @@ def test_the_course_of_memory(tmp_path, capsys, monkeypatch):
     assert all(100 < c["resident_mb"] < 20_000 for c in figures["course"])
     assert xml.fromstring(plot.read_text()).tag.endswith("svg")
     assert json.loads(capsys.readouterr().out)["frames"] == 200
+    assert figures["triangles"] == [] and figures["course"][-1]["views"] == 0
+
+
+def test_a_loop_with_both_halves(demo):
+    figures = benchmark.loop(demo, 150, live_config(Config()), with_dense=True)
+    assert figures["course"][-1]["views"] > 0 and min(figures["triangles"]) > 100
 
 
 def test_four_curves_in_one_picture():

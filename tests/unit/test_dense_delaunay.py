@@ -6,7 +6,7 @@ import pytest
 import reference_dense as reference
 
 from vitamin3d.config import DelaunayConfig
-from vitamin3d.dense.delaunay import triangulate, unique_edges
+from vitamin3d.dense.delaunay import separate_in_order, triangulate, unique_edges
 
 CONFIG = DelaunayConfig(min_vertices=10)
 
@@ -69,3 +69,22 @@ def test_too_few_landmarks_make_no_mesh(snapshot):
 def test_landmarks_on_a_line_make_no_mesh(snapshot):
     line = dataclasses.replace(snapshot, pixels=np.stack([np.arange(200.0) * 2, np.full(200, 3.0)], axis=1))
     assert triangulate(line, CONFIG) is None
+
+
+@pytest.mark.parametrize("distance", [0.5, 3.0, 25.0])
+def test_separation_equals_its_twin(distance):
+    rng = np.random.default_rng(7)
+    pixels, deviations = rng.uniform(0, [127, 95], (400, 2)), rng.integers(1, 4, 400) / 100.0
+    pixels[1] = pixels[0]
+    gaps = np.linalg.norm(pixels[:, None] - pixels, axis=2)
+    worse = (deviations[:, None] > deviations) | ((deviations[:, None] == deviations) & np.tri(400, k=-1, dtype=bool))
+    expected = np.flatnonzero(~((gaps <= distance) & worse).any(axis=1))
+    assert 2 <= len(expected) < 400
+    np.testing.assert_array_equal(np.sort(separate_in_order(pixels, deviations, distance)), expected)
+
+
+def test_neighbours_in_the_picture_are_neighbours_in_memory():
+    pixels = np.random.default_rng(8).uniform(0, [752, 480], (10_000, 2))
+    chosen = separate_in_order(pixels, np.full(10_000, 0.01), 0.5)
+    step = np.linalg.norm(np.diff(pixels[chosen], axis=0), axis=1)
+    assert np.median(step) < 10 and step.max() < 60

@@ -7,7 +7,7 @@ import reference_dense as reference
 
 from vitamin3d.config import DelaunayConfig, ExtrapolationConfig
 from vitamin3d.dense.delaunay import triangulate
-from vitamin3d.dense.extrapolation import extended, outline
+from vitamin3d.dense.extrapolation import extended, nearest, outline
 from vitamin3d.dense.nltgv import vertex_slopes
 
 CAMERA, CONFIG, NORMAL = reference.SMALL, ExtrapolationConfig(spacing_px=16.0), np.array([0.1, 0.2, 0.5])
@@ -56,3 +56,13 @@ def test_the_outline_is_the_undistorted_border():
     back = reference.EUROC.distort(border)
     on_border = [np.isclose(back[:, k], end, atol=1e-3) for k, end in ((0, 0), (0, 751), (1, 0), (1, 479))]
     assert np.any(on_border, axis=0).all() and 55 < len(border) < 65
+
+
+def test_the_nearest_are_those_of_the_twin():
+    rng = np.random.default_rng(1)
+    points, queries = rng.uniform(0, 100, (300, 2)), rng.uniform(-20, 120, (40, 2))
+    gaps = np.linalg.norm(queries[:, None] - points, axis=2)
+    distance, near = nearest(points, queries, 8)
+    np.testing.assert_array_equal(near, np.argsort(gaps, axis=1)[:, :8])
+    np.testing.assert_allclose(distance, np.sort(gaps, axis=1)[:, :8], rtol=1e-12)
+    assert nearest(points[:1], queries, 1)[1].max() == 0

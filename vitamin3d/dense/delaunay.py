@@ -2,10 +2,14 @@
 """Landmarks of a keyframe -> a triangulation in the image (Sec. 4.2, "Meshing")."""
 
 import numpy as np
-from scipy.spatial import Delaunay, QhullError, cKDTree
 
+from vitamin3d._jit import kernel
 from vitamin3d.config import DelaunayConfig
+from vitamin3d.geometry.cells import cell_number, cells_of
+from vitamin3d.geometry.planar_delaunay import delaunay
 from vitamin3d.types import Array, ImageMesh, MapSnapshot
+
+VERTICES_PER_CELL = 2.0
 
 
 def triangulate(snapshot: MapSnapshot, config: DelaunayConfig) -> ImageMesh | None:
@@ -15,17 +19,15 @@ def triangulate(snapshot: MapSnapshot, config: DelaunayConfig) -> ImageMesh | No
         None where fewer than `min_vertices` usable landmarks are left, or all of them lie on a line.
     """
     chosen = _usable(snapshot)
-    chosen = chosen[_is_separate(snapshot.pixels[chosen], snapshot.relative_deviations[chosen], config.min_separation_px)]
+    chosen = chosen[separate_in_order(snapshot.pixels[chosen], snapshot.relative_deviations[chosen], config.min_separation_px)]
     if len(chosen) < max(3, config.min_vertices):
         return None
-    chosen = chosen[_strip_order(snapshot.pixels[chosen])]
     pixels = np.ascontiguousarray(snapshot.pixels[chosen], np.float64)
-    try:
-        triangles = Delaunay(pixels).simplices.astype(np.int32)
-    except QhullError:
+    triangles, edges = delaunay(pixels)
+    if not len(triangles):
         return None
     deviation = np.hypot(snapshot.relative_deviations[chosen], config.deviation_floor)
-    return ImageMesh(pixels, triangles, unique_edges(triangles), 1.0 / snapshot.depths[chosen], deviation)
+    return ImageMesh(pixels, triangles, edges, 1.0 / snapshot.depths[chosen], deviation)
 
 
 def unique_edges(triangles: Array) -> Array:
@@ -42,17 +44,32 @@ def _usable(snapshot: MapSnapshot) -> Array:
     return np.flatnonzero(finite & (snapshot.depths > 0))
 
 
-def _is_separate(pixels: Array, deviations: Array, distance_px: float) -> Array:
-    """(N,) bool: False for the less certain landmark of each pair nearer than `distance_px`."""
-    separate = np.ones(len(pixels), bool)
+@kernel
+def _mark_close(pixels, deviations, order, starts, columns, rows, distance, is_separate):  # type: ignore[no-untyped-def]
+    """Each point against those of its cell and of the next ones, which are at least `distance` wide."""
+    for row in range(rows):
+        for column in range(columns):
+            cell = cell_number(column, row, columns)
+            for v in range(row, min(row + 2, rows)):
+                for u in range(max(column - 1, 0) if v > row else column, min(column + 2, columns)):
+                    other = cell_number(u, v, columns)
+                    for m in range(starts[cell], starts[cell + 1]):
+                        for n in range(m + 1 if other == cell else starts[other], starts[other + 1]):
+                            i, j = order[m], order[n]
+                            x, y = pixels[i, 0] - pixels[j, 0], pixels[i, 1] - pixels[j, 1]
+                            if x * x + y * y <= distance * distance:
+                                is_first = deviations[i] < deviations[j] or (deviations[i] == deviations[j] and i < j)
+                                is_separate[j if is_first else i] = False
+
+
+def separate_in_order(pixels: Array, deviations: Array, distance_px: float) -> Array:
+    """Indices of pixels (N, 2) without the less certain one of each pair within `distance_px` (of equal ones the later one).
+
+    They come row by row of a grid of cells, so that neighbours in the image are neighbours in memory.
+    """
     if len(pixels) == 0:
-        return separate
-    order = np.argsort(deviations, kind="stable")
-    pairs = cKDTree(pixels[order]).query_pairs(distance_px, output_type="ndarray")
-    separate[order[pairs.max(axis=1)]] = False
-    return separate
-
-
-def _strip_order(pixels: Array, strip_px: float = 32.0) -> Array:
-    """Order of the vertices along horizontal strips, so that neighbours in the image are neighbours in memory."""
-    return np.lexsort((pixels[:, 0], np.floor(pixels[:, 1] / strip_px)))
+        return np.zeros(0, np.int64)
+    pixels = np.ascontiguousarray(pixels, np.float64)
+    cells, is_separate = cells_of(pixels, VERTICES_PER_CELL, distance_px), np.ones(len(pixels), np.bool_)
+    _mark_close(pixels, np.asarray(deviations, np.float64), cells.order, cells.starts, cells.columns, cells.rows, distance_px, is_separate)
+    return np.asarray(cells.order[is_separate[cells.order]])

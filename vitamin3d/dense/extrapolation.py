@@ -8,11 +8,11 @@ be lost. The votes of other views (`consistency.py`) decide what of it is fused.
 from dataclasses import replace
 
 import numpy as np
-from scipy.spatial import Delaunay, QhullError, cKDTree
 
+from vitamin3d._jit import kernel
 from vitamin3d.config import ExtrapolationConfig
-from vitamin3d.dense.delaunay import unique_edges
 from vitamin3d.geometry.camera import Camera
+from vitamin3d.geometry.planar_delaunay import delaunay
 from vitamin3d.types import Array, ImageMesh
 
 
@@ -25,6 +25,28 @@ def outline(camera: Camera, spacing_px: float) -> Array:
     return np.asarray(pixels[np.isfinite(pixels).all(axis=1)])
 
 
+@kernel
+def _nearest(points, queries, squared, near):  # type: ignore[no-untyped-def]
+    """Fills `squared` (Q, K), which comes infinite, and `near` (Q, K) by insertion; of equal ones the first comes first."""
+    count = near.shape[1]
+    for q in range(queries.shape[0]):
+        for p in range(points.shape[0]):
+            x, y = points[p, 0] - queries[q, 0], points[p, 1] - queries[q, 1]
+            d, k = x * x + y * y, count - 1
+            if d < squared[q, k]:
+                while k > 0 and d < squared[q, k - 1]:
+                    squared[q, k], near[q, k] = squared[q, k - 1], near[q, k - 1]
+                    k -= 1
+                squared[q, k], near[q, k] = d, p
+
+
+def nearest(points: Array, queries: Array, count: int) -> tuple[Array, Array]:
+    """Distances and indices (Q, count) of the nearest of points (N, 2), N >= count, the nearest first; for few queries."""
+    squared, near = np.full((len(queries), count), np.inf), np.zeros((len(queries), count), np.int64)
+    _nearest(np.ascontiguousarray(points, np.float64), np.ascontiguousarray(queries, np.float64), squared, near)
+    return np.sqrt(squared), near
+
+
 def extended(mesh: ImageMesh, slopes: Array, border: Array, config: ExtrapolationConfig) -> tuple[ImageMesh, Array]:
     """A denoised mesh and its slopes (V, 2), triangulated anew with vertices at the pixels `border` (N, 2).
 
@@ -32,23 +54,19 @@ def extended(mesh: ImageMesh, slopes: Array, border: Array, config: Extrapolatio
     that is far from the inverse depths of these vertices. Its deviation is their median and grows with the distance.
     """
     count = min(config.neighbours, len(mesh.pixels))
-    distance, near = cKDTree(mesh.pixels).query(border, k=count)
-    distance, near = distance.reshape(len(border), count), near.reshape(len(border), count)
+    distance, near = nearest(mesh.pixels, border, count)
     around = mesh.inverse_depth[near]
     continued = np.median(around + ((border[:, None] - mesh.pixels[near]) * slopes[near]).sum(axis=2), axis=1)
     low, high = around.min(axis=1) / config.max_ratio, around.max(axis=1) * config.max_ratio
     good = (continued > low) & (continued < high) & (distance[:, 0] > config.min_distance_px)
     pixels = np.concatenate([mesh.pixels, border[good]])
-    try:
-        triangles = Delaunay(pixels).simplices.astype(np.int32)
-    except QhullError:
-        return mesh, slopes
+    triangles, edges = delaunay(pixels)
     deviations = np.median(mesh.relative_deviation[near], axis=1) * (1.0 + distance[:, 0] / config.doubling_px)
     whole = replace(
         mesh,
         pixels=pixels,
         triangles=triangles,
-        edges=unique_edges(triangles),
+        edges=edges,
         inverse_depth=np.concatenate([mesh.inverse_depth, continued[good]]),
         relative_deviation=np.concatenate([mesh.relative_deviation, deviations[good]]),
     )
