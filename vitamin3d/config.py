@@ -467,6 +467,20 @@ class FusionConfig:
 
 
 @dataclass(frozen=True)
+class RefusionConfig:
+    """At the end of a live run, views whose keyframe moved after they were fused are taken out of the volume and fused anew.
+
+    With `fusion.backend = "blocks"` only. Without --live everything is fused after the last adjustment.
+    """
+
+    enabled: bool = True
+    min_motion_voxels: float = 0.5
+    """What a view shows must have moved by so many fine voxels."""
+    max_megabytes: float = 1000.0
+    """Of views kept in a temporary file; the oldest are forgotten and stay as they were fused."""
+
+
+@dataclass(frozen=True)
 class SurfaceConfig:
     """Cleaning of the extracted meshes."""
 
@@ -505,6 +519,7 @@ class Config:
     consistency: ConsistencyConfig = field(default_factory=ConsistencyConfig)
     photometric: PhotometricConfig = field(default_factory=PhotometricConfig)
     fusion: FusionConfig = field(default_factory=FusionConfig)
+    refusion: RefusionConfig = field(default_factory=RefusionConfig)
     surface: SurfaceConfig = field(default_factory=SurfaceConfig)
 
 

@@ -13,6 +13,7 @@ from vitamin3d.datasets.base import Dataset
 from vitamin3d.datasets.pictures import Unreadable
 from vitamin3d.errors import InputError
 from vitamin3d.exporters.output_folder import OutputFolder
+from vitamin3d.geometry.se3 import inverse
 from vitamin3d.mapping.landmark_statistics import point_cloud
 from vitamin3d.reconstruction import Reconstruction
 from vitamin3d.run_report import write_report
@@ -21,7 +22,7 @@ from vitamin3d.runtime import DENSE_NICENESS, READ_AHEAD, Observer, RunRecord, r
 from vitamin3d.scale import Scale, scale_from_ground_truth
 from vitamin3d.slam import Slam
 from vitamin3d.tracking.front_end import FrontEnd
-from vitamin3d.types import DepthView, MapSnapshot
+from vitamin3d.types import DepthView, MapSnapshot, Trajectory
 from vitamin3d.warmup import warm_up
 from vitamin3d.workers import Clock, Closable, Items, ReadAhead, step
 
@@ -121,6 +122,8 @@ class _JobRun:
         self.dense.finish()
         with step("final adjustment"):
             self.slam.finish()
+        if self.job.live and self.slam.map.num_keyframes:
+            self.dense.fuse_again(self.slam.trajectory())
         if self.slam.map.num_keyframes and not self.job.live:
             self.dense.camera = self.slam.camera
             if self.job.scale_from_truth:
@@ -162,7 +165,7 @@ class _JobRun:
         dense, scale = self.dense, self.dense.scale
         times = [self.front_end.times, self.slam.times, *([dense.reconstruction.times] if dense.reconstruction else [])]
         stats = run_statistics(self.slam, self.record, scale, cloud_points, times, self.watch)
-        stats |= {"source": self.dataset.name, "mode": self.job.config.mode, "voxels": dense.voxels()}
+        stats |= {"source": self.dataset.name, "mode": self.job.config.mode, "voxels": dense.voxels(), "volumes": dense.volumes()}
         stats |= {"skipped": [_line(s) for s in self.record.skipped], "failure": str(failure) if failure else None}
         stats |= {"live": live_table(self.record, dense.mesh_lags) if self.job.live else None}
         self.output.write_stats(stats)
@@ -224,6 +227,8 @@ class _Dense:
     def __init__(self, dataset: Dataset, job: Job, output: OutputFolder, scale: Scale, clock: Clock | None) -> None:
         self.job, self.output, self.scale, self.camera, self.clock = job, output, scale, dataset.camera, clock
         self.reconstruction: Reconstruction | None = None
+        self.num_moved = 0
+        """Views that were fused anew because their keyframe had moved."""
         self.mesh_lags: list[float] = []
         """Seconds from when a keyframe's picture was due until it was in the volume; where there is a clock."""
 
@@ -273,7 +278,7 @@ class _Dense:
 
     def _begun(self) -> Reconstruction:
         if self.reconstruction is None:
-            self.reconstruction = Reconstruction(self.camera, with_voxels(self.job.config, self.scale))
+            self.reconstruction = Reconstruction(self.camera, with_voxels(self.job.config, self.scale), keeps_views=self.job.live)
             self.output.write_canvas(self.reconstruction.canvas, self.scale)
         return self.reconstruction
 
@@ -283,6 +288,25 @@ class _Dense:
             with step("meshing and fusing the last keyframes"):
                 for view in self.reconstruction.finish():
                     self.output.write_view(view, self.scale)
+
+    def fuse_again(self, trajectory: Trajectory) -> None:
+        """Moves the fused views of keyframes that moved afterwards."""
+        if self.reconstruction is not None and self.reconstruction.store is not None:
+            poses = inverse(trajectory.T_world_cam)
+            with step("fusing keyframes anew that moved"):
+                self.num_moved = self.reconstruction.fuse_again(dict(zip(trajectory.timestamps_ns.tolist(), poses, strict=True)))
+
+    def volumes(self) -> dict[str, Any] | None:
+        """Blocks and megabytes of the volumes where they are known, and what was kept and moved of the views."""
+        dense = self.reconstruction
+        if dense is None or dense.low is None or dense.high is None:
+            return None
+        table: dict[str, Any] = {name: _megabytes(volume.size()) for name, volume in (("low", dense.low), ("high", dense.high))}
+        if dense.store is None:
+            return table
+        store = dense.store
+        kept = {"temporary_megabytes": round(store.num_bytes / 1e6, 1), "views_forgotten": store.num_forgotten}
+        return table | {"refusion": kept | {"views_moved": self.num_moved, "failure": store.failure or None}}
 
     def write_surfaces(self, is_broken: bool = False) -> None:
         """Writes the meshes, without the keyframes that still wait where a step is broken."""
@@ -300,6 +324,10 @@ class _Dense:
             return None
         low, high = self.reconstruction.voxel_lengths()
         return {"low": low * self.scale.metres_per_unit, "high": high * self.scale.metres_per_unit}
+
+
+def _megabytes(size: dict[str, int] | None) -> dict[str, float] | None:
+    return None if size is None else {"blocks": size["blocks"], "megabytes": round(size["bytes"] / 1e6, 1)}
 
 
 def with_voxels(config: Config, scale: Scale) -> Config:

@@ -2,7 +2,7 @@
 """The dense half of VITAMIN-E (Sec. 4.2): keyframes with landmark depths -> meshes in the image -> TSDF -> surface."""
 
 import dataclasses
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import replace
 
 import numpy as np
@@ -18,8 +18,10 @@ from vitamin3d.dense.nltgv import denoise
 from vitamin3d.dense.photometric_check import marked, photometrically_checked
 from vitamin3d.dense.surface_extraction import clean
 from vitamin3d.dense.tsdf_fusion import Limits, TsdfVolume, empty_surface
+from vitamin3d.dense.view_store import Packed, ViewStore, packed
 from vitamin3d.geometry.camera import Camera
-from vitamin3d.types import DepthView, MapSnapshot, StepTimes, Surface
+from vitamin3d.geometry.se3 import inverse
+from vitamin3d.types import Array, DepthView, MapSnapshot, StepTimes, Surface
 
 NO_PICTURE = np.zeros((0, 0), np.uint8)
 NO_NORMALS = np.zeros((0, 0, 3), np.float32)
@@ -33,9 +35,10 @@ class Reconstruction:
         camera: of the snapshots' frames.
         config: its dense groups are used.
         times: grows by the milliseconds of each step.
+        keeps_views: fused views are kept, so that `fuse_again` can move them; where the settings and the volume allow it.
     """
 
-    def __init__(self, camera: Camera, config: Config, times: StepTimes | None = None) -> None:
+    def __init__(self, camera: Camera, config: Config, times: StepTimes | None = None, keeps_views: bool = False) -> None:
         self.config = config
         self.times = times if times is not None else StepTimes()
         self.renderer = DepthRenderer(camera, config.depth_rendering)
@@ -48,6 +51,8 @@ class Reconstruction:
         self._waiting: list[DepthView] = []
         self.low: TsdfVolume | None = None
         self.high: TsdfVolume | None = None
+        keeps_views = keeps_views and config.refusion.enabled and config.fusion.backend == "blocks"
+        self.store = ViewStore(int(1e6 * config.refusion.max_megabytes)) if keeps_views else None
 
     @property
     def canvas(self) -> Camera:
@@ -197,10 +202,45 @@ class Reconstruction:
         if self.low is None or self.high is None:
             self.low, self.high = (self._volume(length) for length in self.voxel_lengths())
         max_depth = self.config.fusion.max_depth * float(np.nanmedian(self.median_depths))
+        if self.store is not None:
+            with self.times.timed("keeping_views"):
+                kept = packed(dataclasses.replace(view, depth=np.where(view.depth < max_depth, view.depth, np.float32(0.0))))
+                self.store.add(kept)
+                view, max_depth = kept.view(), np.inf  # exactly what will be taken out again
         with self.times.timed("fusion_low"):
             self.low.integrate(view, self.canvas, max_depth)
         with self.times.timed("fusion_high"):
             self.high.integrate(view, self.canvas, max_depth)
+
+    def fuse_again(self, poses: Mapping[int, Array]) -> int:
+        """Moves the views in the volumes whose keyframe is elsewhere by now; how many.
+
+        Args:
+            poses: T_cam_world (4, 4) by time stamp (ns); views without one stay.
+        """
+        self._fuse_waiting()
+        if self.store is None or self.low is None or self.high is None:
+            return 0
+        least = self.config.refusion.min_motion_voxels * self.high.voxel_length
+        moved = {kept.timestamp_ns for kept in self.store.headers() if self._motion(kept, poses) > least}
+        for view in self.store.views(moved):
+            with self.times.timed("refusion"):
+                at_new_pose = dataclasses.replace(view, T_cam_world=poses[view.timestamp_ns])
+                for volume in (self.low, self.high):
+                    volume.remove(view, self.canvas, np.inf)
+                    volume.integrate(at_new_pose, self.canvas, np.inf)
+        self.store.close()
+        return len(moved)
+
+    def _motion(self, kept: Packed, poses: Mapping[int, Array]) -> float:
+        """The farthest, in map units, that a corner of the picture at the view's middle depth moved in the world."""
+        if kept.timestamp_ns not in poses:
+            return 0.0
+        right, bottom = self.canvas.width - 1.0, self.canvas.height - 1.0
+        corners = self.canvas.rays_from_ideal(np.array([[0.0, 0.0], [right, 0.0], [0.0, bottom], [right, bottom]])) * kept.middle_depth
+        here, there = (inverse(T) for T in (kept.T_cam_world, poses[kept.timestamp_ns]))
+        motions = corners @ (there - here)[:3, :3].T + (there - here)[:3, 3]
+        return float(np.linalg.norm(motions, axis=1).max())
 
     def _volume(self, voxel_length: float) -> TsdfVolume:
         fusion = self.config.fusion

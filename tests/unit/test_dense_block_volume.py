@@ -4,6 +4,7 @@ import dataclasses
 import numpy as np
 import pytest
 import reference_dense as reference
+from scipy.spatial import cKDTree
 
 from vitamin3d.dense import block_volume
 from vitamin3d.dense.block_volume import SIDE, BlockVolume
@@ -41,6 +42,23 @@ def test_voxels_are_those_of_the_definition():
     assert 50 < touched.sum() < 400
     np.testing.assert_allclose(volume._distance[blocks, voxels][touched], distances[touched], atol=2e-4)
     np.testing.assert_allclose(volume._weight[blocks, voxels], weights, atol=2e-4)
+
+
+def test_a_view_taken_out_leaves_what_the_others_say():
+    others, moved = [wall(1.523, 2.0), wall(1.6, 0.5, 0.3)], wall(1.7, 3.0, -0.4)
+    volume, expected = fused(others[0], moved, others[1]), fused(*others)
+    volume.remove(moved, CAMERA, 5.0)
+    place = {tuple(key): k for k, key in enumerate(expected._keys[: expected.num_blocks])}
+    assert volume.num_blocks > expected.num_blocks  # those of the view alone stay, empty
+    for k, key in enumerate(map(tuple, volume._keys[: volume.num_blocks])):
+        twin = place.get(key)
+        weight, distance = (0.0, 0.0) if twin is None else (expected._weight[twin], expected._distance[twin])
+        np.testing.assert_allclose(volume._weight[k], weight, atol=1e-3)
+        firm = volume._weight[k] > 0.01
+        np.testing.assert_allclose(volume._distance[k][firm], np.broadcast_to(distance, firm.shape)[firm], atol=1e-3)
+    one, other = volume.extract(), expected.extract()
+    assert [len(values) for values in one] == [len(values) for values in other]
+    assert cKDTree(one[0]).query(other[0])[0].max() < 1e-4
 
 
 def test_the_certain_view_leads():

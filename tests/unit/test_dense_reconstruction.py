@@ -63,6 +63,41 @@ def test_all_steps_are_timed():
     assert counts == {**each, "surface_low": 1, "surface_high": 1}
 
 
+def test_views_fused_at_a_wrong_pose_are_moved_to_the_right_one():
+    config = dataclasses.replace(CONFIG, fusion=FusionConfig(voxel_low=0.15, voxel_high=0.025, backend="blocks", max_depth=1.2))
+    right = dict(enumerate(snapshots()))
+    stamped = [dataclasses.replace(s, frame=dataclasses.replace(s.frame, timestamp_ns=k)) for k, s in right.items()]
+    expected = reconstructed(config, stamped)
+    shift = exp_se3(np.array([0.0, 0.0, 0.3, 0.0, 0.05, 0.0]))
+    wrong = [dataclasses.replace(s, T_cam_world=shift @ s.T_cam_world) if k in (1, 2) else s for k, s in enumerate(stamped)]
+    moved = reconstructed(config, wrong)
+    assert moved.fuse_again({k: s.T_cam_world for k, s in right.items()}) == 2
+    assert expected.fuse_again({k: s.T_cam_world for k, s in right.items()}) == 0
+    for one, other in zip(moved.surfaces(), expected.surfaces(), strict=True):
+        assert len(one.triangles) == pytest.approx(len(other.triangles), rel=0.002)
+        assert np.abs(np.median(distances(one)) - np.median(distances(other))) < 1e-5
+        assert np.quantile(distances(one), 0.99) == pytest.approx(np.quantile(distances(other), 0.99), rel=0.01)
+    assert np.median(distances(reconstructed(config, wrong).surfaces()[1])) > 2 * np.median(distances(expected.surfaces()[1]))
+
+
+def reconstructed(config, keyframes):
+    """Fused, the views kept; the votes are off: they would see the wrong poses."""
+    config = dataclasses.replace(config, consistency=dataclasses.replace(config.consistency, enabled=False))
+    reconstruction = Reconstruction(reference.SMALL, config, keeps_views=True)
+    for snapshot in keyframes:
+        reconstruction.add_keyframe(snapshot)
+    reconstruction.finish()
+    return reconstruction
+
+
+def test_views_are_kept_only_where_they_can_be_moved():
+    assert Reconstruction(reference.SMALL, CONFIG, keeps_views=True).store is None
+    blocks = dataclasses.replace(CONFIG, fusion=FusionConfig(backend="blocks"))
+    assert Reconstruction(reference.SMALL, blocks).store is None
+    assert Reconstruction(reference.SMALL, blocks, keeps_views=True).store is not None
+    assert Reconstruction(reference.SMALL, CONFIG).fuse_again({}) == 0
+
+
 def test_what_pictures_contradict_is_not_fused():
     """All pictures of these keyframes are flat or noise that no depth explains."""
     photometric = PhotometricConfig(enabled=True, min_inverse_depth_range=0.0)

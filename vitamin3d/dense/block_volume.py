@@ -15,6 +15,8 @@ KEY_BITS, KEY_OFFSET = 21, 1 << 20
 EMPTY = -1
 FIRST_BLOCKS = 1 << 13
 """Capacity at the start; doubles when it is used up."""
+ROUNDING = 1e-4
+"""Of a view's weight; what remains below it after the view was taken out is not left of others."""
 RAY_STRIDE = 3
 """Pixels between the rays along which blocks are allocated."""
 
@@ -85,8 +87,11 @@ def _touch(depth, intrinsics, T_world_cam, block, reach, max_depth, stride, tabl
 
 
 @kernel
-def _integrate(depth, pixel_weights, color, intrinsics, R, t, voxel, truncation, max_depth, touched, keys, distance, weight, shade):  # type: ignore[no-untyped-def]
-    """Averages the signed distance along the ray, in truncations, and the colour into the voxels of the blocks `touched`."""
+def _integrate(depth, pixel_weights, color, intrinsics, R, t, voxel, truncation, max_depth, touched, keys, distance, weight, shade, sign):  # type: ignore[no-untyped-def]
+    """Averages the signed distance along the ray, in truncations, and the colour into the voxels of the blocks `touched`.
+
+    With `sign` -1 the view is taken out again; a voxel of which nothing is left but rounding becomes empty.
+    """
     fx, fy, cx, cy = intrinsics
     height, width = depth.shape
     for n in range(touched.shape[0]):
@@ -115,9 +120,14 @@ def _integrate(depth, pixel_weights, color, intrinsics, R, t, voxel, truncation,
             if not w > 0.0:
                 continue
             before = weight[b, i]
-            share = w / (before + w)
+            after = before + sign * w
+            if after < ROUNDING * w:
+                distance[b, i], weight[b, i] = 0.0, 0.0
+                shade[b, i, 0], shade[b, i, 1], shade[b, i, 2] = 0.0, 0.0, 0.0
+                continue
+            share = sign * w / after
             distance[b, i] += share * (min(signed, 1.0) - distance[b, i])
-            weight[b, i] = before + w
+            weight[b, i] = after
             for c in range(3):
                 shade[b, i, c] += share * (color[v, u, c] - shade[b, i, c])
 
@@ -146,11 +156,18 @@ class BlockVolume:
 
     def integrate(self, view: DepthView, canvas: Camera, max_depth: float) -> None:
         """Averages a view, drawn on `canvas`, into the volume; each pixel by its weight."""
+        self._add(view, canvas, max_depth, 1.0)
+
+    def remove(self, view: DepthView, canvas: Camera, max_depth: float) -> None:
+        """Takes a view out that was integrated just so; what remains is the average of the others but for rounding."""
+        self._add(view, canvas, max_depth, -1.0)
+
+    def _add(self, view: DepthView, canvas: Camera, max_depth: float, sign: float) -> None:
         touched = self._touched(view, canvas, max_depth)
         R, t = np.ascontiguousarray(view.T_cam_world[:3, :3]), np.ascontiguousarray(view.T_cam_world[:3, 3])
         _integrate(
             view.depth, view.weights, view.color, canvas.intrinsics, R, t, self.voxel_length, self.truncation, max_depth,
-            touched, self._keys, self._distance, self._weight, self._shade,
+            touched, self._keys, self._distance, self._weight, self._shade, sign,
         )  # fmt: skip
 
     def _touched(self, view: DepthView, canvas: Camera, max_depth: float) -> Array:

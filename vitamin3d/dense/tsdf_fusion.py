@@ -53,6 +53,25 @@ class TsdfVolume:
         if ((view.depth > 0) & (view.depth < max_depth)).any():
             self._volume.integrate(view, canvas, max_depth)
 
+    @property
+    def can_remove(self) -> bool:
+        """Whether views can be taken out again: of `blocks` alone."""
+        return isinstance(self._volume, _WeightedBlocks)
+
+    def remove(self, view: DepthView, canvas: Camera, max_depth: float) -> None:
+        """Takes a view out that was integrated just so; its pose and pixels must be the same.
+
+        Raises:
+            InputError: the backend cannot.
+        """
+        if not isinstance(self._volume, _WeightedBlocks):
+            raise InputError('only fusion.backend = "blocks" can take views out again')
+        self._volume.remove(view, canvas, max_depth)
+
+    def size(self) -> dict[str, int] | None:
+        """Blocks in use and bytes of them all; None where Open3D does not say."""
+        return self._volume.size()
+
     def extract_surface(self) -> Surface:
         """The zero level (marching cubes), triangles facing the cameras; vertex normals are not filled in yet (zero)."""
         return self._volume.extract_surface()
@@ -64,6 +83,8 @@ class _Backend(Protocol):
     def integrate(self, view: DepthView, canvas: Camera, max_depth: float) -> None: ...
 
     def extract_surface(self) -> Surface: ...
+
+    def size(self) -> dict[str, int] | None: ...
 
 
 class _ScalableVolume:
@@ -93,6 +114,9 @@ class _ScalableVolume:
         )
         pinhole = o3d.camera.PinholeCameraIntrinsic(canvas.width, canvas.height, canvas.fx, canvas.fy, canvas.cx, canvas.cy)
         self._volume.integrate(rgbd, pinhole, view.T_cam_world)
+
+    def size(self) -> dict[str, int] | None:
+        return None
 
     def extract_surface(self) -> Surface:
         mesh = self._volume.extract_triangle_mesh()
@@ -126,6 +150,10 @@ class _VoxelBlockGrid:
         blocks = self._grid.compute_unique_block_coordinates(depth, K, T, *scales)
         self._grid.integrate(blocks, depth, color, K, K, T, *scales)
 
+    def size(self) -> dict[str, int] | None:
+        blocks, bytes_per_voxel = int(self._grid.hashmap().size()), 4 * (1 + 1 + 3)
+        return {"blocks": blocks, "bytes": bytes_per_voxel * BLOCK_RESOLUTION**3 * int(self._grid.hashmap().capacity())}
+
     def extract_surface(self) -> Surface:
         if self._grid.hashmap().size() == 0:
             return empty_surface()
@@ -143,6 +171,12 @@ class _WeightedBlocks:
 
     def integrate(self, view: DepthView, canvas: Camera, max_depth: float) -> None:
         self._volume.integrate(view, canvas, max_depth)
+
+    def remove(self, view: DepthView, canvas: Camera, max_depth: float) -> None:
+        self._volume.remove(view, canvas, max_depth)
+
+    def size(self) -> dict[str, int] | None:
+        return {"blocks": self._volume.num_blocks, "bytes": self._volume.num_bytes}
 
     def extract_surface(self) -> Surface:
         return _surface(*self._volume.extract())
