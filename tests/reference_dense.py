@@ -50,9 +50,9 @@ def nltgv_matrix(problem):
 
 
 def nltgv_solve(problem, start, iterations):
-    """Pock and Chambolle (2011), Algorithm 1 with alpha = 1, on the dense matrix."""
-    K = nltgv_matrix(problem)
-    sigma, tau = 1.0 / np.abs(K).sum(axis=1), 1.0 / np.abs(K).sum(axis=0)
+    """Pock and Chambolle (2011), Algorithm 1 with alpha = 1, on the dense matrix; the steps in the problem's ratio."""
+    K, share = nltgv_matrix(problem), problem.primal_share
+    sigma, tau = 1.0 / np.abs(K).sum(axis=1) / share, share / np.abs(K).sum(axis=0)
     z, threshold = problem.data, tau[0::3] * problem.data_weights
     x, q = start.ravel().copy(), np.zeros(len(K))
     x_bar = x.copy()

@@ -127,3 +127,10 @@ def test_switched_off_it_changes_nothing():
     mesh = noisy(plane(), 0.05)
     result = denoise(mesh, NltgvConfig(enabled=False))
     np.testing.assert_allclose(result.mesh.inverse_depth, mesh.inverse_depth, rtol=1e-12)
+
+
+def test_small_primal_steps_save_iterations():
+    mesh = noisy(plane(3000), 0.05)
+    few, unscaled = (denoise(mesh, NltgvConfig(iterations=50, primal_share=share)).energies[1] for share in (0.03, 1.0))
+    best = denoise(mesh, NltgvConfig(iterations=3000)).energies[1]
+    assert best < few < 1.1 * best and few < 0.9 * unscaled

@@ -6,7 +6,8 @@
 with alpha = 1 / ||u_i - u_j||: every vertex has an inverse depth xi and a slope w, piecewise planes cost nothing, and a
 plane in the world is a plane in inverse depth. It has the form `min_x F(K x) + G(x)` and is solved by the primal-dual
 algorithm of Chambolle and Pock with over-relaxation 1 and the diagonal step sizes of Pock and Chambolle (2011),
-tau_v = 1 / sum_e |K_ev| and sigma_e = 1 / sum_v |K_ev|, which leave nothing to tune.
+tau_v = s / sum_e |K_ev| and sigma_e = 1 / (s sum_v |K_ev|). Their ratio s leaves the minimum where it is; with far smaller
+primal than dual steps (s = 0.03 instead of 1) an eighth of the iterations comes as near to it.
 """
 
 from dataclasses import dataclass, replace
@@ -31,6 +32,8 @@ class NltgvProblem:
     data_weights: Array
     """(V,) lambda omega."""
     beta: float
+    primal_share: float
+    """s, the ratio of the steps."""
 
     @property
     def alpha(self) -> Array:
@@ -70,23 +73,31 @@ def normalized_problem(mesh: ImageMesh, config: NltgvConfig) -> NltgvProblem:
     pixels = mesh.pixels / config.pixel_unit
     i, j = mesh.edges[:, 0], mesh.edges[:, 1]
     data = mesh.inverse_depth / mesh.inverse_depth.mean()
-    return NltgvProblem(
-        mesh.edges, pixels[i] - pixels[j], data, config.data_weight * config.full_deviation / mesh.relative_deviation, config.slope_weight
-    )
+    weights = config.data_weight * config.full_deviation / mesh.relative_deviation
+    return NltgvProblem(mesh.edges, pixels[i] - pixels[j], data, weights, config.slope_weight, config.primal_share)
+
+
+@kernel
+def _objective(edges, offsets, beta, data, weights, state):  # type: ignore[no-untyped-def]
+    energy = 0.0
+    for e in range(edges.shape[0]):
+        i, j, du, dv = edges[e, 0], edges[e, 1], offsets[e, 0], offsets[e, 1]
+        bend = abs(state[i, 0] - state[j, 0] - state[i, 1] * du - state[i, 2] * dv) / np.sqrt(du * du + dv * dv)
+        energy += bend + beta * (abs(state[i, 1] - state[j, 1]) + abs(state[i, 2] - state[j, 2]))
+    for v in range(data.shape[0]):
+        energy += weights[v] * abs(state[v, 0] - data[v])
+    return energy
 
 
 def objective(problem: NltgvProblem, state: Array) -> float:
     """The energy that `solve` minimises, at `state` (V, 3) `[xi, w_u, w_v]`."""
-    i, j = problem.edges[:, 0], problem.edges[:, 1]
-    xi, w = state[:, 0], state[:, 1:]
-    bend = problem.alpha * np.abs(xi[i] - xi[j] - (w[i] * problem.offsets).sum(axis=1))
-    kink = problem.beta * np.abs(w[i] - w[j]).sum(axis=1)
-    return float(bend.sum() + kink.sum() + (problem.data_weights * np.abs(xi - problem.data)).sum())
+    return float(_objective(problem.edges, problem.offsets, problem.beta, problem.data, problem.data_weights, state))
 
 
 @kernel
-def _chambolle_pock(edges, rows, beta, tau, data, shrinkage, iterations, x, x_bar, dual, gradient):  # type: ignore[no-untyped-def]
-    """`rows` (E, 4): alpha, alpha du, alpha dv, sigma. `x`, `x_bar`, `gradient` (V, 3), `dual` (E, 3); all but the first seven change."""
+def _chambolle_pock(edges, rows, beta, rate, tau, data, shrinkage, iterations, x, x_bar, dual, gradient):  # type: ignore[no-untyped-def]
+    """`rows` (E, 4): alpha, alpha du, alpha dv, sigma; `rate` is sigma beta of the slopes. `x`, `x_bar`, `gradient` (V, 3) and
+    `dual` (E, 3) change."""
     for _ in range(iterations):
         gradient[:] = 0.0
         for e in range(edges.shape[0]):  # dual ascent, projection on |q| <= 1, and K^T q
@@ -95,8 +106,8 @@ def _chambolle_pock(edges, rows, beta, tau, data, shrinkage, iterations, x, x_ba
             xi_i, u_i, v_i = x_bar[i, 0], x_bar[i, 1], x_bar[i, 2]
             bend = a * (xi_i - x_bar[j, 0]) - au * u_i - av * v_i
             q1 = min(max(dual[e, 0] + rows[e, 3] * bend, -1.0), 1.0)
-            q2 = min(max(dual[e, 1] + 0.5 * (u_i - x_bar[j, 1]), -1.0), 1.0)  # sigma beta = 1/2
-            q3 = min(max(dual[e, 2] + 0.5 * (v_i - x_bar[j, 2]), -1.0), 1.0)
+            q2 = min(max(dual[e, 1] + rate * (u_i - x_bar[j, 1]), -1.0), 1.0)
+            q3 = min(max(dual[e, 2] + rate * (v_i - x_bar[j, 2]), -1.0), 1.0)
             dual[e, 0], dual[e, 1], dual[e, 2] = q1, q2, q3
             gradient[i, 0] += a * q1
             gradient[j, 0] -= a * q1
@@ -118,7 +129,8 @@ def solve(problem: NltgvProblem, start: Array, iterations: int) -> Array:
     x = np.array(start, np.float64)
     dual = np.zeros((len(problem.edges), 3))
     shrinkage = tau[:, 0] * problem.data_weights
-    _chambolle_pock(problem.edges, rows, problem.beta, tau, problem.data, shrinkage, iterations, x, x.copy(), dual, np.empty_like(x))
+    rate = 0.5 / problem.primal_share  # a slope's row of K is beta and -beta
+    _chambolle_pock(problem.edges, rows, problem.beta, rate, tau, problem.data, shrinkage, iterations, x, x.copy(), dual, np.empty_like(x))
     return x
 
 
@@ -126,12 +138,12 @@ def _preconditioned(problem: NltgvProblem) -> tuple[Array, Array]:
     """Rows (E, 4) of K for the kernel with their sigma, and tau (V, 3)."""
     alpha, count = problem.alpha, len(problem.data)
     slopes = alpha[:, None] * problem.offsets
-    sigma = 1.0 / (2.0 * alpha + np.abs(slopes).sum(axis=1))
+    sigma = 1.0 / (problem.primal_share * (2.0 * alpha + np.abs(slopes).sum(axis=1)))
     i, ends = problem.edges[:, 0], problem.edges.ravel()
     along = np.stack([np.bincount(i, np.abs(slopes[:, k]), count) for k in range(2)], axis=1)
     degree = problem.beta * np.bincount(ends, minlength=count)
     columns = np.column_stack([np.bincount(ends, np.repeat(alpha, 2), count), along + degree[:, None]])
-    return np.column_stack([alpha, slopes, sigma]), 1.0 / np.maximum(columns, 1e-12)
+    return np.column_stack([alpha, slopes, sigma]), problem.primal_share / np.maximum(columns, 1e-12)
 
 
 def vertex_slopes(mesh: ImageMesh) -> Array:
