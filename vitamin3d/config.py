@@ -305,6 +305,16 @@ class SnapshotConfig:
     """What a landmark's observations have in common does not average out: the variance of a residual times 1 + this × their number."""
     max_relative_deviation: float = 0.5
     max_reprojection_rms_px: float = 1.5
+    unobserved: bool = False
+    """Landmarks that a keyframe sees without observing them too. Off: the swept pixels are there already (docs/dense.md)."""
+    occlusion_neighbours: int = 5
+    """An unobserved landmark must lie between the depths of so many observed ones around it,"""
+    occlusion_radius_px: float = 40.0
+    """all of them nearer than this,"""
+    occlusion_tolerance: float = 0.02
+    """give or take this share of the inverse depth;"""
+    max_occlusion_range: float = 0.25
+    """where their own inverse depths differ by more, nothing is said."""
 
 
 @dataclass(frozen=True)

@@ -29,6 +29,7 @@ from vitamin3d.mapping.readout_estimation import set_image_motion
 from vitamin3d.mapping.relocalization import relocalize
 from vitamin3d.mapping.sparse_map import SparseMap
 from vitamin3d.mapping.two_view_initialization import initialize_from_two_views
+from vitamin3d.mapping.visible_landmarks import with_unobserved
 from vitamin3d.mapping.window_adjustment import AdjustAtOnce, Adjuster, WindowAdjustment, store_adjustment
 from vitamin3d.mapping.window_prior import WindowPrior
 from vitamin3d.mapping.window_selection import Window, build_problem, select_frame_window, select_window, store_solution, whole_map
@@ -383,6 +384,8 @@ class Slam:
     def snapshot(self, keyframe: int, frame: Frame) -> MapSnapshot:
         """A keyframe with the depths of its landmarks as the map has them now; its picture as if read at one moment."""
         vertices = keyframe_vertices(self.map, keyframe, self.camera, self.config.snapshot)
+        if self.config.snapshot.unobserved:
+            vertices = with_unobserved(vertices, self.map, keyframe, self.camera, self.config.snapshot)
         motion = self.map.image_motions[keyframe]
         return MapSnapshot(at_one_moment(frame, motion, self.camera), self.map.clone_pose(keyframe), *vertices)
 

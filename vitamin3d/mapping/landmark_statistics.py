@@ -2,6 +2,7 @@
 """What the map knows about its landmarks: observations, parallax, reprojection error, deviation of the depth."""
 
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 
@@ -129,19 +130,34 @@ def relative_depth_deviations(information: Array, points_world: Array, T_cam_wor
     return np.where(regular, np.sqrt(np.maximum(variance, 0.0)) / np.maximum(depth, 1e-12), np.inf)
 
 
-def keyframe_vertices(sparse_map: SparseMap, keyframe: int, camera: Camera, config: SnapshotConfig) -> tuple[Array, Array, Array]:
-    """The landmarks observed in a keyframe: ideal pixels of their projections (N, 2), depths (N,), relative deviations (N,)."""
+class Vertices(NamedTuple):
+    """Landmarks as a keyframe sees them."""
+
+    pixels: Array
+    """(N, 2) ideal pixels of their projections."""
+    depths: Array
+    """(N,)."""
+    relative_deviations: Array
+    """(N,)."""
+
+
+def keyframe_vertices(sparse_map: SparseMap, keyframe: int, camera: Camera, config: SnapshotConfig) -> Vertices:
+    """The landmarks observed in a keyframe."""
     rows = sparse_map.observations_of(keyframe)
     ids = sparse_map.obs_landmark[rows]
-    good = sparse_map.obs_valid[rows] & sparse_map.is_mapped(ids) & (sparse_map.num_observations[ids] >= config.min_observations)
-    ids = ids[good]
+    return vertices_of(sparse_map, ids[sparse_map.obs_valid[rows] & sparse_map.is_mapped(ids)], keyframe, camera, config)
+
+
+def vertices_of(sparse_map: SparseMap, ids: Array, keyframe: int, camera: Camera, config: SnapshotConfig) -> Vertices:
+    """Of landmarks (N,) ids, those in front of a keyframe's camera whose depth is known well enough."""
+    ids = ids[sparse_map.num_observations[ids] >= config.min_observations]
     points, T = sparse_map.points_world[ids], sparse_map.T_cam_world[keyframe]
     in_camera = points @ T[:3, :3].T + T[:3, 3]
     information, squared, count = unit_information(sparse_map, ids, camera)
     variances, rms = observation_variances(squared, count, config), np.sqrt(squared / np.maximum(count, 1))
     deviations = relative_depth_deviations(information / variances[:, None, None], points, T)
     usable = (in_camera[:, 2] > 0) & (deviations < config.max_relative_deviation) & (rms < config.max_reprojection_rms_px)
-    return camera.ideal_from_points(in_camera[usable]), in_camera[usable, 2], deviations[usable]
+    return Vertices(camera.ideal_from_points(in_camera[usable]), in_camera[usable, 2], deviations[usable])
 
 
 def point_cloud(sparse_map: SparseMap, camera: Camera, config: CloudConfig, noise: SnapshotConfig) -> PointCloud:
