@@ -137,7 +137,7 @@ def sweep_cost(image, sources, motions, camera, inverse_depths):
         for signature, motion in zip(others, motions, strict=True):
             x = np.array([(u - camera.cx) / camera.fx, (v - camera.cy) / camera.fy, 1.0]) + inverse_depths[d] * motion
             a, b = camera.fx * x[0] / x[2] + camera.cx, camera.fy * x[1] / x[2] + camera.cy
-            a, b = int(a + 0.5), int(b + 0.5)
+            a, b = int(np.floor(a + 0.5)), int(np.floor(b + 0.5))
             if 0 <= a < camera.width and 0 <= b < camera.height and signature[b, a] is not None:
                 distances.append(sum(p != q for p, q in zip(reference[v, u], signature[b, a], strict=True)))
         if distances:
@@ -157,7 +157,7 @@ def path_cost(cost, image, small, large, step):
         if not (0 <= w < height and 0 <= x < width):
             out[v, u] = cost[v, u]
             continue
-        edge = max(large * 10.0 / (10.0 + abs(float(image[v, u]) - float(image[w, x]))), 1.5 * small)
+        edge = np.rint(max(large * 10.0 / (10.0 + abs(float(image[v, u]) - float(image[w, x]))), 1.5 * small))
         before = out[w, x]
         for d in range(planes):
             jumps = [before[k] + (0 if k == d else small if abs(k - d) == 1 else edge) for k in range(planes)]

@@ -2,9 +2,10 @@
 """Eight numbers at a time, for kernels: LLVM does not vectorise sums whose order it must keep, nor gathers from many arrays.
 
 Inside a kernel `Lanes` are eight float64 and calculate like one number, with numbers too; `Indices` are eight int64, `Masks` eight
-truths. Each operation is one of LLVM's on a vector of eight, which becomes one or several instructions of whatever processor there is.
-A product and the sum it goes into may be fused, as the processor can; NaN and infinities are what they are. Arrays that are
-read and written must be C-contiguous and are addressed as flat ones; nothing checks bounds.
+truths. `Singles` are sixteen float32, `Shorts` sixteen int16, which nothing keeps from overflowing. Each operation is one of LLVM's
+on a vector, which becomes one or several instructions of whatever processor there is. A product and the sum it goes into may be
+fused, as the processor can; NaN and infinities are what they are. Arrays that are read and written must be C-contiguous and are
+addressed as flat ones; nothing checks bounds.
 """
 
 import operator
@@ -17,16 +18,17 @@ from numba.core import cgutils, types
 from numba.core.typing.templates import ConcreteTemplate, infer_global, signature
 from numba.extending import intrinsic, lower_builtin, models, register_model
 
-WIDTH = 8
-_BOOL, _INT32, _INT64, _DOUBLE = ir.IntType(1), ir.IntType(32), ir.IntType(64), ir.DoubleType()
+WIDTH, WIDE = 8, 16
+_BOOL, _INT16, _INT32, _INT64 = ir.IntType(1), ir.IntType(16), ir.IntType(32), ir.IntType(64)
+_DOUBLE, _SINGLE = ir.DoubleType(), ir.FloatType()
 
 
 class LanesType(types.Type):  # type: ignore[misc,unused-ignore]
     """Eight numbers of one kind, as numba knows them."""
 
-    def __init__(self, name: str, element: Any) -> None:
+    def __init__(self, name: str, element: Any, width: int) -> None:
         super().__init__(name=name)
-        self.vector = ir.VectorType(element, WIDTH)
+        self.vector = ir.VectorType(element, width)
 
 
 class _VectorModel(models.PrimitiveModel):  # type: ignore[misc,unused-ignore]
@@ -35,18 +37,20 @@ class _VectorModel(models.PrimitiveModel):  # type: ignore[misc,unused-ignore]
 
 
 register_model(LanesType)(_VectorModel)
-Lanes, Indices, Masks = LanesType("Lanes", _DOUBLE), LanesType("Indices", _INT64), LanesType("Masks", _BOOL)
-_SCALARS = {Lanes: types.float64, Indices: types.int64, Masks: types.boolean}
+Lanes, Indices, Masks = (LanesType(*kind, WIDTH) for kind in (("Lanes", _DOUBLE), ("Indices", _INT64), ("Masks", _BOOL)))
+Singles, Shorts = LanesType("Singles", _SINGLE, WIDE), LanesType("Shorts", _INT16, WIDE)
+_SCALARS = {Lanes: types.float64, Indices: types.int64, Masks: types.boolean, Singles: types.float32, Shorts: types.int64}
 
 
 def _vector(builder: Any, kind: LanesType, numba_type: Any, value: Any) -> Any:
     """A vector as it is, a number eight times."""
     if isinstance(numba_type, LanesType):
         return value
-    if kind is Masks:
-        value = builder.trunc(value, _BOOL)
-    first = builder.insert_element(ir.Constant(kind.vector, ir.Undefined), value, _INT32(0))
-    return builder.shuffle_vector(first, ir.Constant(kind.vector, ir.Undefined), ir.Constant(ir.VectorType(_INT32, WIDTH), [0] * WIDTH))
+    if kind in (Masks, Shorts):
+        value = builder.trunc(value, kind.vector.element)
+    nothing, count = ir.Constant(kind.vector, ir.Undefined), kind.vector.count
+    first = builder.insert_element(nothing, value, _INT32(0))
+    return builder.shuffle_vector(first, nothing, ir.Constant(ir.VectorType(_INT32, count), [0] * count))
 
 
 def _operation(function: Any, kind: LanesType, result: LanesType, build: Callable[..., Any]) -> None:
@@ -73,11 +77,12 @@ for _functions, _instructions in (
     ((operator.add, operator.iadd), ("fadd", "add")),
     ((operator.sub, operator.isub), ("fsub", "sub")),
     ((operator.mul, operator.imul), ("fmul", "mul")),
-    ((operator.truediv,), ("fdiv",)),
+    ((operator.truediv,), ("fdiv", None)),
 ):
     for _function in _functions:
-        for _kind, _instruction in zip((Lanes, Indices), _instructions, strict=False):
-            _operation(_function, _kind, _kind, partial(_arithmetic, instruction=_instruction))
+        for _kind, _instruction in zip((Lanes, Indices, Singles, Shorts), 2 * _instructions, strict=True):
+            if _instruction is not None:
+                _operation(_function, _kind, _kind, partial(_arithmetic, instruction=_instruction))
 for _function, _sign in ((operator.lt, "<"), (operator.le, "<="), (operator.gt, ">"), (operator.ge, ">=")):
     for _kind in (Lanes, Indices):
         _operation(_function, _kind, Masks, partial(_compared, sign=_sign))
@@ -155,6 +160,107 @@ def total(typing, x):  # type: ignore[no-untyped-def]
 
 
 @intrinsic  # type: ignore[untyped-decorator,unused-ignore]
+def total_single(typing, x):  # type: ignore[no-untyped-def]
+    """The sum of `Singles`, always in the same order."""
+
+    def build(context, builder, sig, arguments):  # type: ignore[no-untyped-def]
+        parts, left = arguments[0], WIDE
+        while left > 1:  # the upper half onto the lower one
+            left //= 2
+            low, high = (ir.Constant(ir.VectorType(_INT32, left), list(range(k, k + left))) for k in (0, left))
+            parts = builder.fadd(builder.shuffle_vector(parts, parts, low), builder.shuffle_vector(parts, parts, high))
+        return builder.extract_element(parts, _INT32(0))
+
+    return types.float32(Singles), build
+
+
+@intrinsic  # type: ignore[untyped-decorator,unused-ignore]
+def shorts(typing, number):  # type: ignore[no-untyped-def]
+    """The number sixteen times."""
+    return Shorts(types.int64), lambda context, builder, sig, arguments: _vector(builder, Shorts, types.int64, arguments[0])
+
+
+@intrinsic  # type: ignore[untyped-decorator,unused-ignore]
+def singles(typing, number):  # type: ignore[no-untyped-def]
+    """The number sixteen times."""
+    return Singles(types.float32), lambda context, builder, sig, arguments: _vector(builder, Singles, types.float32, arguments[0])
+
+
+@intrinsic  # type: ignore[untyped-decorator,unused-ignore]
+def least(typing, x):  # type: ignore[no-untyped-def]
+    """The smallest of `Shorts`."""
+
+    def build(context, builder, sig, arguments):  # type: ignore[no-untyped-def]
+        function_type = ir.FunctionType(_INT16, [Shorts.vector])
+        function = cgutils.get_or_insert_function(builder.module, function_type, f"llvm.vector.reduce.smin.v{WIDE}i16")
+        return builder.sext(builder.call(function, arguments), _INT64)
+
+    return types.int64(Shorts), build
+
+
+@intrinsic  # type: ignore[untyped-decorator,unused-ignore]
+def lesser(typing, a, b):  # type: ignore[no-untyped-def]
+    """Lane by lane the smaller one of `Shorts`, or of these and a number."""
+    a, b = (t if t is Shorts else types.int64 for t in (a, b))
+
+    def build(context, builder, sig, arguments):  # type: ignore[no-untyped-def]
+        one, other = (_vector(builder, Shorts, t, x) for t, x in zip(sig.args, arguments, strict=True))
+        return builder.select(builder.icmp_signed("<", one, other), one, other)
+
+    return Shorts(a, b), build
+
+
+@intrinsic  # type: ignore[untyped-decorator,unused-ignore]
+def where_below(typing, a, limit, x, y):  # type: ignore[no-untyped-def]
+    """Lane by lane x where a is below the limit, else y; `Shorts`, or numbers."""
+    arguments = tuple(t if t is Shorts else types.int64 for t in (a, limit, x, y))
+
+    def build(context, builder, sig, arguments):  # type: ignore[no-untyped-def]
+        one, other, yes, no = (_vector(builder, Shorts, t, x) for t, x in zip(sig.args, arguments, strict=True))
+        return builder.select(builder.icmp_signed("<", one, other), yes, no)
+
+    return Shorts(*arguments), build
+
+
+@intrinsic  # type: ignore[untyped-decorator,unused-ignore]
+def counting_shorts(typing, first):  # type: ignore[no-untyped-def]
+    """Shorts first, first + 1, ..."""
+
+    def build(context, builder, sig, arguments):  # type: ignore[no-untyped-def]
+        return builder.add(_vector(builder, Shorts, types.int64, arguments[0]), ir.Constant(Shorts.vector, list(range(WIDE))))
+
+    return Shorts(types.int64), build
+
+
+@intrinsic  # type: ignore[untyped-decorator,unused-ignore]
+def load_shorts(typing, array, first):  # type: ignore[no-untyped-def]
+    """Sixteen neighbouring numbers of an array of int16 or uint8."""
+
+    def build(context, builder, sig, arguments):  # type: ignore[no-untyped-def]
+        loaded = _loaded(context, builder, sig, arguments)
+        return loaded if loaded.type == Shorts.vector else builder.zext(loaded, Shorts.vector)
+
+    return Shorts(array, types.int64), build
+
+
+@intrinsic  # type: ignore[untyped-decorator,unused-ignore]
+def load_singles(typing, array, first):  # type: ignore[no-untyped-def]
+    """Sixteen neighbouring numbers of an array of float32 or uint8."""
+
+    def build(context, builder, sig, arguments):  # type: ignore[no-untyped-def]
+        loaded = _loaded(context, builder, sig, arguments)
+        return loaded if loaded.type == Singles.vector else builder.uitofp(loaded, Singles.vector)
+
+    return Singles(array, types.int64), build
+
+
+def _loaded(context: Any, builder: Any, sig: Any, arguments: Any) -> Any:
+    """Sixteen of whatever the array holds."""
+    pointer = _address(context, builder, sig.args[0], *arguments)
+    return builder.load(builder.bitcast(pointer, ir.VectorType(pointer.type.pointee, WIDE).as_pointer()), align=1)
+
+
+@intrinsic  # type: ignore[untyped-decorator,unused-ignore]
 def greatest(typing, x):  # type: ignore[no-untyped-def]
     """The largest of the lanes."""
 
@@ -215,14 +321,15 @@ def load(typing, array, first):  # type: ignore[no-untyped-def]
 
 @intrinsic  # type: ignore[untyped-decorator,unused-ignore]
 def store(typing, array, first, x):  # type: ignore[no-untyped-def]
-    """Writes eight neighbouring numbers into an array."""
+    """Writes neighbouring numbers into an array of their kind."""
 
     def build(context, builder, sig, arguments):  # type: ignore[no-untyped-def]
         pointer = _address(context, builder, sig.args[0], *arguments[:2])
-        builder.store(arguments[2], builder.bitcast(pointer, Lanes.vector.as_pointer()), align=8)
+        vector = sig.args[2].vector
+        builder.store(arguments[2], builder.bitcast(pointer, vector.as_pointer()), align=2 if vector == Shorts.vector else 4)
         return context.get_dummy_value()
 
-    return types.void(array, types.int64, Lanes), build
+    return types.void(array, types.int64, x if x in (Shorts, Singles) else Lanes), build
 
 
 @intrinsic  # type: ignore[untyped-decorator,unused-ignore]

@@ -22,7 +22,7 @@ def test_signatures_are_those_of_the_definition():
     ours, theirs = census(image), reference.census(image)
     assert 0 < sum(s is not None for s in theirs.ravel()) < image.size
     for signature, text in zip(ours.ravel(), theirs.ravel(), strict=True):
-        assert bin(int(signature))[2:] == ("0" if text is None else "1" + text)
+        assert bin(int(signature))[2:] == ("0" if text is None else "1" + text[:31] + "0" + text[31:])  # the centre itself
 
 
 def test_costs_are_those_of_the_definition():
@@ -33,16 +33,33 @@ def test_costs_are_those_of_the_definition():
     sweep.depths(image, sources, motions, planes)
     expected = reference.sweep_cost(image, sources, motions, TINY, planes)
     assert len(np.unique(expected)) > 10
-    np.testing.assert_allclose(sweep._cost, expected, atol=1e-5)
+    np.testing.assert_array_equal(0.5 * sweep._cost[..., :6], expected)
 
 
 def test_paths_are_those_of_the_definition():
-    rng = np.random.default_rng(5)
-    cost, image = rng.uniform(0, 40, (7, 9, 5)).astype(np.float32), noise((7, 9))
-    total = np.empty_like(cost)
-    plane_sweep._aggregate(cost, image, np.float32(3.0), np.float32(20.0), total)
-    expected = sum(reference.path_cost(cost, image, 3.0, 20.0, step) for step in ((0, 1), (0, -1), (1, 0), (-1, 0)))
-    np.testing.assert_allclose(total, expected, rtol=1e-5)
+    rng, planes = np.random.default_rng(5), 19
+    cost, image = rng.integers(0, 125, (7, 9, planes)).astype(np.uint8), noise((7, 9))
+    filled, total, ceiling = np.zeros((7, 9, 32), np.uint8), np.empty((7, 9, 32), np.int16), np.full(32, plane_sweep.FILLING, np.int16)
+    filled[..., :planes], ceiling[:planes] = cost, 0
+    plane_sweep._aggregate(filled, image, 6, plane_sweep.edge_penalties(3.0, 20.0), ceiling, total)
+    expected = sum(reference.path_cost(cost, image, 6.0, 40.0, step) for step in ((0, 1), (0, -1), (1, 0), (-1, 0)))
+    np.testing.assert_array_equal(total[..., :planes], expected)
+    assert total[..., planes:].min() > total[..., :planes].max()
+
+
+def test_the_winner_is_that_of_the_definition():
+    rng, planes = np.random.default_rng(6), 21
+    cost, total = rng.integers(0, 125, (8, 9, 32)).astype(np.uint8), rng.integers(50, 400, (8, 9, 32)).astype(np.int16)
+    total[..., planes:] = 4 * plane_sweep.FILLING
+    found, distinctness, winner_cost = np.zeros((8, 9)), np.zeros((8, 9), np.float32), np.zeros((8, 9), np.float32)
+    plane_sweep._choose(total, cost, planes, 0.2, 0.1, found, distinctness, winner_cost)
+    for v, u in np.ndindex(8, 9):
+        t = total[v, u, :planes].astype(float)
+        k = int(t.argmin())
+        assert winner_cost[v, u] == 0.5 * cost[v, u, k]
+        assert distinctness[v, u] == pytest.approx(t[np.abs(np.arange(planes) - k) > 2].min() / t[k])
+        between = (t[k - 1] - t[k + 1]) / (t[k - 1] + t[k + 1] - 2 * t[k]) / 2 if 0 < k < planes - 1 else 0.0
+        assert found[v, u] == pytest.approx(0.2 + 0.1 * (k + between) if 0 < k < planes - 1 else 0.0)
 
 
 def shifted_scene(disparity_per_depth, inverse_depth):

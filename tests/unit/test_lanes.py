@@ -5,7 +5,31 @@ import numpy as np
 import pytest
 
 from vitamin3d._jit import kernel
-from vitamin3d._lanes import WIDTH, any_of, counting, gather, greatest, lanes, load, scatter, select, square_root, store, total, transposed
+from vitamin3d._lanes import (
+    WIDE,
+    WIDTH,
+    any_of,
+    counting,
+    counting_shorts,
+    gather,
+    greatest,
+    lanes,
+    least,
+    lesser,
+    load,
+    load_shorts,
+    load_singles,
+    scatter,
+    select,
+    shorts,
+    singles,
+    square_root,
+    store,
+    total,
+    total_single,
+    transposed,
+    where_below,
+)
 
 
 @pytest.fixture
@@ -93,3 +117,39 @@ def test_nan_stays_nan(ab):
     a[5], b[2] = np.nan, np.inf
     arithmetic(a, b, 1.0, out)
     assert np.isnan(out[[0, 1, 2, 3, 4, 5, 7], 5]).all() and np.isinf(out[0, 2]) and out[3, 2] == 0.0
+
+
+@kernel
+def with_shorts(a, b, c, out):
+    x, y = load_shorts(a, 1), load_shorts(b, 0)
+    store(out, 0, x + y - c)
+    store(out, WIDE, lesser(x, y))
+    store(out, 2 * WIDE, lesser(x, c))
+    store(out, 3 * WIDE, where_below(x, y, counting_shorts(c), shorts(-2)))
+    return least(x), least(y)
+
+
+def test_sixteen_shorts(rng):
+    a, b = rng.integers(-3000, 3000, WIDE + 1).astype(np.int16), rng.integers(0, 255, WIDE).astype(np.uint8)
+    out = np.empty((4, WIDE), np.int16)
+    assert with_shorts(a, b, 7, out) == (a[1:].min(), b.min())
+    x, y = a[1:].astype(int), b.astype(int)
+    expected = [x + y - 7, np.minimum(x, y), np.minimum(x, 7), np.where(x < y, 7 + np.arange(WIDE), -2)]
+    np.testing.assert_array_equal(out, expected)
+
+
+@kernel
+def with_singles(a, b, c, out):
+    x, y = load_singles(a, 1), load_singles(b, 0)
+    store(out, 0, x + y)
+    store(out, WIDE, x - c)
+    store(out, 2 * WIDE, c * x)
+    store(out, 3 * WIDE, singles(c))
+    return total_single(x)
+
+
+def test_sixteen_singles(rng):
+    a, b, c = rng.standard_normal(WIDE + 1).astype(np.float32), rng.integers(0, 255, WIDE).astype(np.uint8), np.float32(0.7)
+    out = np.empty((4, WIDE), np.float32)
+    assert with_singles(a, b, c, out) == pytest.approx(a[1:].sum(), abs=1e-5)
+    np.testing.assert_allclose(out, [a[1:] + b, a[1:] - c, c * a[1:], np.full(WIDE, c)], rtol=1e-6)

@@ -11,7 +11,8 @@ from dataclasses import dataclass, replace
 import cv2
 import numpy as np
 
-from vitamin3d._jit import kernel
+from vitamin3d._jit import inlined, kernel
+from vitamin3d._lanes import WIDE, load_singles, singles, store, total_single
 from vitamin3d.config import DensificationConfig
 from vitamin3d.dense.neighbour_queue import Around
 from vitamin3d.dense.plane_sweep import PlaneSweep, SweptDepth, turned
@@ -46,36 +47,65 @@ def canvas_picture(snapshot: MapSnapshot, image: Array, is_outside: Array) -> Ca
     return CanvasPicture(snapshot, image, np.where(outside, np.uint8(0), np.maximum(reduced, np.uint8(1))))
 
 
+@inlined
+def _centered_patch(image, first, width, side, mask, patch):  # type: ignore[no-untyped-def]
+    """Writes the grey levels around a pixel without their mean into `patch`, rows filled up to sixteens; their power."""
+    filled, size = mask.shape[0], np.float32(side * side)
+    added = singles(np.float32(0.0))
+    for x in range(0, filled, WIDE):
+        for y in range(side):
+            added += load_singles(image, first + y * width + x) * load_singles(mask, x)
+    mean, powers = total_single(added) / size, singles(np.float32(0.0))
+    for x in range(0, filled, WIDE):
+        for y in range(side):
+            centered = (load_singles(image, first + y * width + x) - mean) * load_singles(mask, x)
+            store(patch, y * filled + x, centered)
+            powers += centered * centered
+    return total_single(powers)
+
+
+@inlined
+def _zncc(patch, power, source, first, width, side, mask, p, q):  # type: ignore[no-untyped-def]
+    """ZNCC of a centred patch with the source's, whose first pixel lies (p, q) after `first`; linear between pixels."""
+    filled, size, one = mask.shape[0], np.float32(side * side), np.float32(1.0)
+    near = np.float32(source[first + (side // 2) * (width + 1)])  # what is subtracted keeps sums of squares small, and exact
+    added, powers, products = singles(np.float32(0.0)), singles(np.float32(0.0)), singles(np.float32(0.0))
+    for x in range(0, filled, WIDE):
+        inside, at = load_singles(mask, x), first + x
+        upper = (one - p) * load_singles(source, at) + p * load_singles(source, at + 1)
+        for y in range(side):
+            at += width
+            lower = (one - p) * load_singles(source, at) + p * load_singles(source, at + 1)
+            other = ((one - q) * upper + q * lower - near) * inside
+            added += other
+            powers += other * other
+            products += other * load_singles(patch, y * filled + x)
+            upper = lower
+    summed = total_single(added)
+    return total_single(products) / np.sqrt(power * (total_single(powers) - summed * summed / size + np.float32(1e-3)))
+
+
 @kernel
-def _refine(image, sources, motions, intrinsics, pixels, start, step, steps, radius, refined, score):  # type: ignore[no-untyped-def]
-    """Inverse depth (N,) where patches agree best: mean ZNCC of the two best sources; NaN where that is at an end or flat."""
-    height, width = image.shape
-    fx, fy, cx, cy = intrinsics
-    size = (2 * radius + 1) ** 2
-    patch, other = np.empty(size, np.float32), np.empty(size, np.float32)
-    scores = np.empty(2 * steps + 1, np.float32)
+def _refine(image, sources, motions, camera, pixels, start, step, steps, radius, mask, refined, score):  # type: ignore[no-untyped-def]
+    """Inverse depth (N,) where patches agree best: mean ZNCC of the two best sources; NaN where that is at an end or flat.
+
+    `image` and `sources` are flat, with room for sixteen pixels after the last; `camera` fx, fy, cx, cy, width, height.
+    """
+    fx, fy, cx, cy = camera[0], camera[1], camera[2], camera[3]
+    width, height, side = int(camera[4]), int(camera[5]), 2 * radius + 1
+    patch, scores = np.empty(side * mask.shape[0], np.float32), np.empty(2 * steps + 1, np.float32)
     for n in range(pixels.shape[0]):
         refined[n], score[n] = np.nan, 0.0
         u, v = pixels[n, 0], pixels[n, 1]
         if u < radius or v < radius or u >= width - radius or v >= height - radius:
             continue
-        i, mean = 0, np.float32(0.0)
-        for y in range(-radius, radius + 1):
-            for x in range(-radius, radius + 1):
-                patch[i] = image[v + y, u + x]
-                mean += patch[i]
-                i += 1
-        mean /= np.float32(size)
-        power = np.float32(0.0)
-        for i in range(size):
-            patch[i] -= mean
-            power += patch[i] * patch[i]
-        if power < size * MIN_PATCH_DEVIATION**2:
+        power = _centered_patch(image, (v - radius) * width + u - radius, width, side, mask, patch)
+        if power < side * side * MIN_PATCH_DEVIATION**2:
             continue
         for k in range(2 * steps + 1):
             xi = start[n] + (k - steps) * step[n]
             best, second = np.float32(-1.0), np.float32(-1.0)
-            for s in range(sources.shape[0]):
+            for s in range(motions.shape[0]):
                 z = 1.0 + xi * motions[s, 2]
                 if z <= 0.1:
                     continue
@@ -84,40 +114,22 @@ def _refine(image, sources, motions, intrinsics, pixels, start, step, steps, rad
                 left, top = int(np.floor(a)), int(np.floor(b))
                 if left < radius or top < radius or left >= width - radius - 1 or top >= height - radius - 1:
                     continue
-                p, q = np.float32(a - left), np.float32(b - top)
-                one = np.float32(1.0)
-                w00, w01, w10, w11 = (one - p) * (one - q), p * (one - q), (one - p) * q, p * q
-                i, mean = 0, np.float32(0.0)
-                for y in range(-radius, radius + 1):
-                    for x in range(-radius, radius + 1):
-                        r, c = top + y, left + x
-                        other[i] = (
-                            w00 * sources[s, r, c]
-                            + w01 * sources[s, r, c + 1]
-                            + w10 * sources[s, r + 1, c]
-                            + w11 * sources[s, r + 1, c + 1]
-                        )
-                        mean += other[i]
-                        i += 1
-                mean /= np.float32(size)
-                product, other_power = np.float32(0.0), np.float32(1e-3)
-                for i in range(size):
-                    t = other[i] - mean
-                    product += patch[i] * t
-                    other_power += t * t
-                zncc = product / np.sqrt(power * other_power)
+                first = (s * height + top - radius) * width + left - radius
+                zncc = _zncc(patch, power, sources, first, width, side, mask, np.float32(a - left), np.float32(b - top))
                 second = max(second, min(best, zncc))
                 best = max(best, zncc)
             scores[k] = np.float32(0.5) * (best + second)
-        k = 0
-        for m in range(2 * steps + 1):
-            if scores[m] > scores[k]:
-                k = m
+        k = int(np.argmax(scores))
         if 0 < k < 2 * steps:
             bend = 2.0 * scores[k] - scores[k - 1] - scores[k + 1]
             if bend > 0.0:
                 refined[n] = start[n] + (k - steps + 0.5 * (scores[k + 1] - scores[k - 1]) / bend) * step[n]
                 score[n] = scores[k]
+
+
+def _flat(pictures: Array) -> Array:
+    """Grey levels one after the other, with room to read sixteen from the last."""
+    return np.concatenate([pictures.ravel(), np.zeros(WIDE, pictures.dtype)])
 
 
 class Densifier:
@@ -152,7 +164,7 @@ class Densifier:
         self._sweep = self._sweep or PlaneSweep(self.reduced, self.config)
         swept = self._sweep.depths(picture.reduced, small, motions, self._planes(snapshot))
         rows, columns = self._distinct(swept, self._planes(snapshot))
-        full = np.stack([turned(s.image, self.canvas, R) for s, R in zip(sources, rotations, strict=True)]).astype(np.float32)
+        full = np.stack([turned(s.image, self.canvas, R) for s, R in zip(sources, rotations, strict=True)])
         pixels = REDUCTION * np.stack([columns, rows], axis=1).astype(np.int64)
         return self._joined(snapshot, *self._refined(picture, full, motions, pixels, swept.inverse_depth[rows, columns]))
 
@@ -206,9 +218,13 @@ class Densifier:
         rates = self._pixels_per_relative_depth(pixels, inverse_depths, motions)
         step = REFINEMENT_STEP_PX * inverse_depths / np.maximum(rates.max(axis=1), 1e-3)
         refined, score = np.empty(len(pixels)), np.empty(len(pixels))
+        radius = config.patch_px // 2
+        filled = -(-(2 * radius + 1) // WIDE) * WIDE
+        mask = (np.arange(filled) <= 2 * radius).astype(np.float32)
+        camera = np.array([*self.canvas.intrinsics, self.canvas.width, self.canvas.height])
         _refine(
-            picture.image.astype(np.float32), sources, motions, self.canvas.intrinsics, pixels, inverse_depths, step,
-            REFINEMENT_STEPS, config.patch_px // 2, refined, score,
+            _flat(picture.image), _flat(sources), motions, camera, pixels, inverse_depths, step,
+            REFINEMENT_STEPS, radius, mask, refined, score,
         )  # fmt: skip
         deviations = config.sigma_px / np.maximum(np.sqrt((np.sort(rates, axis=1)[:, -3:] ** 2).sum(axis=1)), 1e-3)
         good = np.isfinite(refined) & (refined > 0) & (score > config.min_zncc) & (deviations < config.max_relative_deviation)
