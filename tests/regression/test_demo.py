@@ -70,7 +70,7 @@ def test_surface_lies_on_the_true_one(demo_run: Path) -> None:
 
 def test_every_promised_file_is_there(demo_run: Path) -> None:
     names = {p.name for p in demo_run.iterdir()}
-    expected = {"trajectory.tum", "keyframes.tum", "cloud.ply", "mesh_low.ply", "mesh_high.ply", "mesh_high.obj"}
+    expected = {"trajectory.tum", "keyframes.tum", "cloud.ply", "mesh_low.ply", "mesh_high.ply", "mesh_high.obj", "mesh_high.mtl"}
     assert names == expected | {"calibration.yaml", "config.toml", "stats.json", "tracks.npz", "report.html", "normals", "depth"}
     assert load_toml(demo_run / "config.toml") == Config()
     stamps = [line.split()[0] for line in (demo_run / "keyframes.tum").read_text().splitlines() if not line.startswith("#")]

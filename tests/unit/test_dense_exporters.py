@@ -46,8 +46,20 @@ def test_open3d_reads_meshes(write, name, surface, tmp_path):
 def test_obj_text(surface, tmp_path):
     write_obj(surface, tmp_path / "a.obj", ["a comment"])
     lines = (tmp_path / "a.obj").read_text().splitlines()
-    assert lines[0] == "# a comment" and lines[1] == "v -1 -1 2 0 0.502 1"
-    assert lines[5] == "vn 0 0 -1" and lines[-1] == "f 1//1 4//4 3//3"
+    assert lines[:3] == ["# a comment", "mtllib a.mtl", "v -1 -1 2 0 0.502 1"]
+    assert (tmp_path / "a.mtl").read_text().splitlines()[:3] == ["newmtl vertex_colors", "Ka 1 1 1", "Kd 1 1 1"]
+    assert lines[6] == "vn 0 0 -1" and lines[-1] == "f 1//1 4//4 3//3"
+
+
+def test_meshlab_reads_the_colours_of_an_obj(surface, tmp_path):
+    pymeshlab = pytest.importorskip("pymeshlab")
+    write_obj(surface, tmp_path / "a.obj", [])
+    meshes = pymeshlab.MeshSet()
+    meshes.load_new_mesh(str(tmp_path / "a.obj"))
+    mesh = meshes.current_mesh()
+    corners = np.asarray(mesh.face_matrix())
+    np.testing.assert_allclose(mesh.vertex_matrix()[corners], surface.vertices_world[surface.triangles])
+    np.testing.assert_allclose(mesh.vertex_color_matrix()[corners][..., :3], surface.colors[surface.triangles] / 255.0, atol=0.005)
 
 
 def test_clouds_keep_all_properties(tmp_path):

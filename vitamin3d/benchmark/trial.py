@@ -23,7 +23,7 @@ from vitamin3d.exporters.files import write_file
 from vitamin3d.exporters.report import thinned_rows
 
 NO_MAP, BAD_INPUT = 3, 2
-HEAVY = ("depth/*.png", "normals/*.png", "mesh_high.obj", "mesh_low.ply", "tracks.npz")
+HEAVY = ("depth/*.png", "normals/*.png", "mesh_high.obj", "mesh_high.mtl", "mesh_low.ply", "tracks.npz")
 """Files of a trial that are removed once it is scored, but for its first one, unless all are to be kept."""
 REMEMBERED = ("success_rate", "frames", "processed_frames", "keyframes", "cpu_seconds", "peak_memory_mb", "steps")
 """What of `stats.json`."""

@@ -22,6 +22,7 @@ CLOUD = np.dtype(
 QUALITY = ("num_observations", "parallax_deg", "reprojection_rms_px", "depth_deviation")
 PLY_NAMES = {"<f4": "float", "|u1": "uchar", "<i4": "int"}
 CHUNK_LINES = 20_000
+MATERIAL = b"newmtl vertex_colors\nKa 1 1 1\nKd 1 1 1\nKs 0 0 0\nd 1\nillum 1\n"
 
 
 def write_ply(surface: Surface, path: Path, comments: list[str]) -> None:
@@ -82,10 +83,14 @@ def read_cloud_ply(path: Path) -> tuple[PointCloud, list[str]]:
 def write_obj(surface: Surface, path: Path, comments: list[str]) -> None:
     """Text OBJ with vertex colours (`v x y z r g b`, as MeshLab and Blender read them) and normals.
 
+    Its material, in an MTL of the same name beside it, is white and matt, so that it leaves the colours as they are.
+
     Raises:
-        OutputError: the file cannot be written.
+        OutputError: a file cannot be written.
     """
-    write_file(path, (text.encode() for text in _obj_text(surface, comments)))
+    material = path.with_suffix(".mtl")
+    write_file(material, [MATERIAL])
+    write_file(path, (text.encode() for text in _obj_text(surface, comments, material.name)))
 
 
 def read_ply(path: Path) -> Surface:
@@ -134,10 +139,12 @@ def _header(vertices: Array, comments: list[str], face_lines: list[str]) -> byte
     return "\n".join([*lines, *face_lines, "end_header\n"]).encode("ascii", "replace")
 
 
-def _obj_text(surface: Surface, comments: list[str]) -> Iterator[str]:
+def _obj_text(surface: Surface, comments: list[str], material: str) -> Iterator[str]:
     yield "".join(f"# {line}\n" for comment in comments for line in comment.splitlines())
+    yield f"mtllib {material}\n"
     yield from _lines("v %.6g %.6g %.6g %.4g %.4g %.4g\n", np.hstack([surface.vertices_world, surface.colors / 255.0]))
     yield from _lines("vn %.4g %.4g %.4g\n", surface.normals_world)
+    yield "usemtl vertex_colors\n"
     yield from _lines("f %d//%d %d//%d %d//%d\n", np.repeat(surface.triangles + 1, 2, axis=1))
 
 

@@ -29,6 +29,7 @@ FILES = (
     "mesh_low.ply",
     "mesh_high.ply",
     "mesh_high.obj",
+    "mesh_high.mtl",
     "calibration.yaml",
     "config.toml",
     "stats.json",
