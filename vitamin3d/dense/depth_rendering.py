@@ -4,7 +4,7 @@
 import cv2
 import numpy as np
 
-from vitamin3d._jit import kernel
+from vitamin3d._jit import inlined, kernel
 from vitamin3d.config import DepthRenderingConfig
 from vitamin3d.geometry.camera import Camera
 from vitamin3d.types import Array, DepthView, Frame, ImageMesh, MapSnapshot
@@ -31,7 +31,7 @@ class DepthRenderer:
         shift = np.array([self.canvas.cx - self.camera.cx, self.canvas.cy - self.camera.cy])
         layers = np.column_stack([mesh.inverse_depth, slopes, mesh.relative_deviation])
         drawn = rasterize(mesh.pixels + shift, kept, layers, self.canvas.width, self.canvas.height)
-        drawn[self.is_outside] = 0.0
+        drawn[self.is_outside, 0] = 0.0
         depth, normals = depth_and_normals(drawn[..., :3], self.canvas)
         weights = inverse_variances(depth, drawn[..., 3])
         return DepthView(snapshot.frame.timestamp_ns, snapshot.T_cam_world, depth, normals, self._draw_color(snapshot.frame), weights)
@@ -42,35 +42,73 @@ class DepthRenderer:
         return drawn if drawn.ndim == 3 else np.asarray(cv2.cvtColor(drawn, cv2.COLOR_GRAY2RGB))
 
 
+@kernel
+def _weigh(depth, deviations, weights):  # type: ignore[no-untyped-def]
+    for v in range(depth.shape[0]):
+        d, relative, out = depth[v], deviations[v], weights[v]
+        for u in range(depth.shape[1]):
+            deviation = d[u] * relative[u]
+            out[u] = 1.0 / (deviation * deviation) if deviation > 0.0 else 0.0
+
+
 def inverse_variances(depth: Array, relative_deviations: Array) -> Array:
     """(H, W) float32 `1 / (depth * relative deviation)²`, per squared map unit; 0 where there is no depth."""
-    deviations = depth * relative_deviations
-    return np.asarray(np.divide(1.0, deviations**2, out=np.zeros(depth.shape), where=deviations > 0), np.float32)
+    weights = np.empty(depth.shape, np.float32)
+    _weigh(depth, relative_deviations, weights)
+    return weights
 
 
 def is_surface(mesh: ImageMesh, camera: Camera, config: DepthRenderingConfig) -> Array:
     """(F,) bool: triangles that may be a surface; not those that span a depth edge, are seen at a grazing angle or are huge."""
-    corners = mesh.inverse_depth[mesh.triangles]
-    is_smooth = np.ptp(corners, axis=1) <= config.max_inverse_depth_range * corners.mean(axis=1)
-    a, b, c = (mesh.pixels[mesh.triangles[:, k]] for k in range(3))
-    longest = np.sqrt(np.max([((p - q) ** 2).sum(axis=1) for p, q in ((a, b), (b, c), (c, a))], axis=0))
-    is_short = longest <= config.max_edge_ratio * camera.width
-    return np.asarray(is_smooth & is_short & (slant_cosines(mesh, camera) >= np.cos(np.deg2rad(config.max_slant_deg))))
-
-
-def slant_cosines(mesh: ImageMesh, camera: Camera) -> Array:
-    """(F,) cosine between the triangle's normal in space and the ray to its centre: 1 seen from the front, 0 edge on."""
     points = camera.rays_from_ideal(mesh.pixels) / mesh.inverse_depth[:, None]
-    a, b, c = (points[mesh.triangles[:, k]] for k in range(3))
-    normal, center = np.cross(b - a, c - a), a + b + c
-    length = np.linalg.norm(normal, axis=1) * np.linalg.norm(center, axis=1)
-    return np.asarray(np.abs((normal * center).sum(axis=1)) / np.maximum(length, 1e-300))
+    kept = np.empty(len(mesh.triangles), np.bool_)
+    longest, cosine = config.max_edge_ratio * camera.width, float(np.cos(np.deg2rad(config.max_slant_deg)))
+    _keep(mesh.pixels, mesh.inverse_depth, points, mesh.triangles, config.max_inverse_depth_range, longest, cosine, kept)
+    return kept
+
+
+@inlined
+def _slant_cosine(points, a, b, c):  # type: ignore[no-untyped-def]
+    """Between the normal of a triangle in space and the ray to its centre: 1 seen from the front, 0 edge on."""
+    px, py, pz = points[b, 0] - points[a, 0], points[b, 1] - points[a, 1], points[b, 2] - points[a, 2]
+    qx, qy, qz = points[c, 0] - points[a, 0], points[c, 1] - points[a, 1], points[c, 2] - points[a, 2]
+    nx, ny, nz = py * qz - pz * qy, pz * qx - px * qz, px * qy - py * qx
+    x, y = points[a, 0] + points[b, 0] + points[c, 0], points[a, 1] + points[b, 1] + points[c, 1]
+    z = points[a, 2] + points[b, 2] + points[c, 2]
+    length = np.sqrt((nx * nx + ny * ny + nz * nz) * (x * x + y * y + z * z))
+    return abs(nx * x + ny * y + nz * z) / max(length, 1e-300)
 
 
 @kernel
-def _rasterize(pixels, triangles, layers, out):  # type: ignore[no-untyped-def]
-    """Scanlines; every layer is affine inside a triangle, the largest first layer (the nearest surface) wins."""
-    height, width, count = out.shape
+def _keep(pixels, inverse_depth, points, triangles, max_range, max_edge, min_cosine, kept):  # type: ignore[no-untyped-def]
+    for f in range(triangles.shape[0]):
+        a, b, c = triangles[f, 0], triangles[f, 1], triangles[f, 2]
+        za, zb, zc = inverse_depth[a], inverse_depth[b], inverse_depth[c]
+        is_smooth = max(za, max(zb, zc)) - min(za, min(zb, zc)) <= max_range * (za + zb + zc) / 3.0
+        longest = 0.0
+        for i, j in ((a, b), (b, c), (c, a)):
+            longest = max(longest, (pixels[i, 0] - pixels[j, 0]) ** 2 + (pixels[i, 1] - pixels[j, 1]) ** 2)
+        kept[f] = is_smooth and longest <= max_edge * max_edge and _slant_cosine(points, a, b, c) >= min_cosine
+
+
+@inlined
+def _plane(layers, a, b, c, k, bu, bv, cu, cv):  # type: ignore[no-untyped-def]
+    """A layer's value at the first corner and its change along u and v."""
+    by_b, by_c = layers[b, k] - layers[a, k], layers[c, k] - layers[a, k]
+    return layers[a, k], cv * by_b - bv * by_c, bu * by_c - cu * by_b
+
+
+@inlined
+def _end(slope, sign):  # type: ignore[no-untyped-def]
+    """A line of this slope along u reaches a height at height * the first + the second, where it enters (sign 1) or leaves (-1)
+    what lies above; a line that does not is far away."""
+    return (1.0 / slope, 0.0) if slope * sign > 1e-12 else (0.0, -1e9 * sign)
+
+
+@kernel
+def _rasterize(pixels, triangles, layers, first, second, third, fourth):  # type: ignore[no-untyped-def]
+    """Scanlines; each of four layers is affine inside a triangle, the largest in the first one (the nearest surface) wins."""
+    height, width = first.shape
     slack = 1e-9
     for f in range(triangles.shape[0]):
         a, b, c = triangles[f, 0], triangles[f, 1], triangles[f, 2]
@@ -84,51 +122,59 @@ def _rasterize(pixels, triangles, layers, out):  # type: ignore[no-untyped-def]
         left = max(0, int(np.ceil(au + min(0.0, min(bu, cu)))))
         right = min(width - 1, int(np.floor(au + max(0.0, max(bu, cu)))))
         bu, bv, cu, cv = bu / area, bv / area, cu / area, cv / area
+        p, p_u, p_v = _plane(layers, a, b, c, 0, bu, bv, cu, cv)
+        q, q_u, q_v = _plane(layers, a, b, c, 1, bu, bv, cu, cv)
+        r, r_u, r_v = _plane(layers, a, b, c, 2, bu, bv, cu, cv)
+        w, w_u, w_v = _plane(layers, a, b, c, 3, bu, bv, cu, cv)
+        s_in, s_from = _end(cv, 1.0)
+        t_in, t_from = _end(-bv, 1.0)
+        r_in, r_from = _end(bv - cv, 1.0)
+        s_out, s_to = _end(cv, -1.0)
+        t_out, t_to = _end(-bv, -1.0)
+        r_out, r_to = _end(bv - cv, -1.0)
         for v in range(top, bottom + 1):
-            entered = False
-            for u in range(left, right + 1):
-                s = (u - au) * cv - (v - av) * cu
-                t = (v - av) * bu - (u - au) * bv
-                if s < -slack or t < -slack or s + t > 1.0 + slack:
-                    if entered:
-                        break
-                    continue
-                entered = True
-                nearness = (1.0 - s - t) * layers[a, 0] + s * layers[b, 0] + t * layers[c, 0]
-                if nearness > out[v, u, 0]:
-                    out[v, u, 0] = nearness
-                    for k in range(1, count):
-                        out[v, u, k] = (1.0 - s - t) * layers[a, k] + s * layers[b, k] + t * layers[c, k]
+            y = v - av
+            hs, ht, hr = y * cu - slack, -y * bu - slack, y * (bu - cu) - 1.0 - slack
+            begin = au + max(hs * s_in + s_from, max(ht * t_in + t_from, hr * r_in + r_from))
+            end = au + min(hs * s_out + s_to, min(ht * t_out + t_to, hr * r_out + r_to))
+            for u in range(max(left, int(np.ceil(begin))), min(right, int(np.floor(end))) + 1):
+                x = u - au
+                nearness = p + x * p_u + y * p_v
+                if nearness > first[v, u]:
+                    first[v, u], second[v, u] = nearness, q + x * q_u + y * q_v
+                    third[v, u], fourth[v, u] = r + x * r_u + y * r_v, w + x * w_u + y * w_v
 
 
 def rasterize(pixels: Array, triangles: Array, layers: Array, width: int, height: int) -> Array:
-    """Image (height, width, L) float64 of vertex values `layers` (V, L), linear inside each triangle; 0 where there is none.
+    """Image (height, width, L) float64 of vertex values `layers` (V, L), L <= 4, linear inside each triangle; 0 where there is none.
 
     Args:
         pixels: (V, 2) positions in this image.
         triangles: (F, 3) int32.
         layers: the first is the inverse depth, which decides where triangles overlap.
+
+    In memory one layer comes after the other.
     """
-    out = np.zeros((height, width, layers.shape[1]))
-    _rasterize(np.ascontiguousarray(pixels, np.float64), triangles, np.ascontiguousarray(layers, np.float64), out)
-    return out
+    count = layers.shape[1]
+    values, out = np.zeros((len(layers), 4)), np.zeros((4, height, width))
+    values[:, :count] = layers
+    _rasterize(np.ascontiguousarray(pixels, np.float64), triangles, values, *out)
+    return np.moveaxis(out[:count], 0, 2)
 
 
 @kernel
-def _shade(layers, intrinsics, depth, normals):  # type: ignore[no-untyped-def]
+def _shade(xi, slope_u, slope_v, intrinsics, depth, normals):  # type: ignore[no-untyped-def]
     """The plane <n, X> = 1 has the inverse depth <n, ray>: its gradient gives n_x / fx and n_y / fy, n_z is what remains."""
     fx, fy, cx, cy = intrinsics
-    for v in range(layers.shape[0]):
-        y = (v - cy) / fy
-        for u in range(layers.shape[1]):
-            xi = layers[v, u, 0]
-            if not xi > 0.0:
-                continue
-            nx, ny = layers[v, u, 1] * fx, layers[v, u, 2] * fy
-            nz = xi - nx * (u - cx) / fx - ny * y
-            length = np.sqrt(nx * nx + ny * ny + nz * nz)
-            depth[v, u] = 1.0 / xi
-            normals[v, u, 0], normals[v, u, 1], normals[v, u, 2] = -nx / length, -ny / length, -nz / length
+    for v in range(xi.shape[0]):
+        y, nearness, across, down, far, normal = (v - cy) / fy, xi[v], slope_u[v], slope_v[v], depth[v], normals[v]
+        for u in range(xi.shape[1]):
+            is_there = nearness[u] > 0.0
+            nx, ny = across[u] * fx, down[u] * fy
+            nz = nearness[u] - nx * (u - cx) / fx - ny * y
+            scale = -1.0 / np.sqrt(nx * nx + ny * ny + nz * nz) if is_there else 0.0
+            far[u] = 1.0 / nearness[u] if is_there else 0.0
+            normal[u, 0], normal[u, 1], normal[u, 2] = nx * scale, ny * scale, nz * scale
 
 
 def depth_and_normals(layers: Array, canvas: Camera) -> tuple[Array, Array]:
@@ -137,6 +183,6 @@ def depth_and_normals(layers: Array, canvas: Camera) -> tuple[Array, Array]:
     Args:
         layers: (H, W, 3) inverse depth and its gradient per pixel, `[xi, d xi / du, d xi / dv]`; xi = 0 where there is nothing.
     """
-    depth, normals = np.zeros(layers.shape[:2], np.float32), np.zeros((*layers.shape[:2], 3), np.float32)
-    _shade(layers, canvas.intrinsics, depth, normals)
+    depth, normals = np.empty(layers.shape[:2], np.float32), np.empty((*layers.shape[:2], 3), np.float32)
+    _shade(*(np.ascontiguousarray(layers[..., k]) for k in range(3)), canvas.intrinsics, depth, normals)
     return depth, normals
