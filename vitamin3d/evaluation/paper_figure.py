@@ -65,7 +65,7 @@ def paper_figure(run: Path, others: list[str], dataset: Dataset | None, viewpoin
     if dataset is not None:
         height, width = panels["mesh"].shape[:2]
         panels = {"tracked extrema": tracked_extrema(run, dataset, timestamp_ns, (width, height), with_picture), **panels}
-    return side_by_side(list(panels.values()), list(panels))
+    return side_by_side(list(panels.values()), list(panels), columns=3 if len(panels) <= 6 else 4)
 
 
 def _view(run: Path, viewpoint: Viewpoint) -> tuple[Camera, Array, int]:
