@@ -184,5 +184,6 @@ def depth_and_normals(layers: Array, canvas: Camera) -> tuple[Array, Array]:
         layers: (H, W, 3) inverse depth and its gradient per pixel, `[xi, d xi / du, d xi / dv]`; xi = 0 where there is nothing.
     """
     depth, normals = np.empty(layers.shape[:2], np.float32), np.empty((*layers.shape[:2], 3), np.float32)
-    _shade(*(np.ascontiguousarray(layers[..., k]) for k in range(3)), canvas.intrinsics, depth, normals)
+    xi, slope_u, slope_v = (np.ascontiguousarray(layers[..., k]) for k in range(3))
+    _shade(xi, slope_u, slope_v, canvas.intrinsics, depth, normals)
     return depth, normals
