@@ -7,7 +7,7 @@
 Ours: curvature and its extrema, flow, prediction and climb of all tracks, refill, as `Slam` does before a map is there.
 KLT: `cv2.calcOpticalFlowPyrLK`, 21×21 windows, three levels, forward only, of our tracks' points of the previous frame
 (OpenCV builds both pyramids within the call). The two take turns frame by frame, and turns at going first, so that other
-load on the machine hits both. Reading pictures is not timed.
+load on the machine hits both. Times are CPU times of the one thread; reading pictures is not timed.
 """
 
 import argparse
@@ -52,17 +52,17 @@ class Tracker:
 
     def process(self, frame: Frame) -> None:
         """One frame: curvature, extrema, flow; predict and climb; every few frames refill."""
-        start = time.perf_counter()
+        start = time.thread_time()
         front = self.front_end.process(frame)
-        after_front_end = time.perf_counter()
+        after_front_end = time.thread_time()
         self.tracks = self._tracked(front)
-        after_climb = time.perf_counter()
+        after_climb = time.thread_time()
         if self._frame_count % self.config.extrema.refill_interval == 0:
             self._refill(front)
-            self.times.add("refill", time.perf_counter() - after_climb)
+            self.times.add("refill", time.thread_time() - after_climb)
         self._frame_count += 1
         self.times.add("predict_climb", after_climb - after_front_end)
-        self.times.add("total", time.perf_counter() - start)
+        self.times.add("total", time.thread_time() - start)
 
     def _tracked(self, front: FrontEndFrame) -> Tracks:
         if front.dense_flow is not None:
@@ -84,7 +84,7 @@ class Tracker:
         self.front_end.times.milliseconds.clear()
 
 
-def klt_milliseconds(previous: Array, current: Array, pixels: Array, clock: Callable[[], float] = time.perf_counter) -> float:
+def klt_milliseconds(previous: Array, current: Array, pixels: Array, clock: Callable[[], float] = time.thread_time) -> float:
     """Time of OpenCV's KLT for pixels (N, 2) of the previous picture."""
     points = np.ascontiguousarray(pixels, np.float32).reshape(-1, 1, 2)
     start = clock()

@@ -9,7 +9,7 @@ from vitamin3d.config import CurvatureConfig, ExtremaConfig
 from vitamin3d.tracking.curvature import _curvature, curvature
 from vitamin3d.tracking.dominant_flow import fit_affine_flow
 from vitamin3d.tracking.extrema import detect_extrema, refine_extrema, select_free_extrema
-from vitamin3d.tracking.extrema_tracking import merge_meeting_tracks
+from vitamin3d.tracking.extrema_tracking import one_per_pixel
 from vitamin3d.types import Tracks
 
 sides = st.integers(1, 14)
@@ -92,5 +92,5 @@ def test_merging_leaves_the_best_track_per_pixel(seed, count):
     best = {}
     for place, rank in zip(map(tuple, np.rint(pixels).astype(int).tolist()), zip(missed, -ages, ids, strict=True), strict=True):
         best[place] = min(best.get(place, rank), rank)
-    merged = merge_meeting_tracks(tracks, 10)
+    merged = tracks.select(one_per_pixel(tracks, np.ones(count, np.bool_), (10, 10)))
     assert sorted(merged.ids.tolist()) == sorted(int(id_) for *_, id_ in best.values())

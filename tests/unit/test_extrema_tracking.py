@@ -12,7 +12,7 @@ from vitamin3d.tracking.curvature import curvature
 from vitamin3d.tracking.extrema import detect_extrema, refine_extrema
 from vitamin3d.tracking.extrema_tracking import (
     _climb_all,
-    merge_meeting_tracks,
+    one_per_pixel,
     predict_by_dense_flow,
     predict_by_dominant_flow,
     track_extrema,
@@ -171,14 +171,15 @@ def test_tracks_that_meet_are_merged_into_the_oldest():
     ("ids", "ages", "missed", "winner"), [([4, 9], [3, 8], [0, 1], 4), ([4, 9], [3, 8], [0, 0], 9), ([9, 4], [3, 3], [0, 0], 4)]
 )
 def test_a_seen_track_wins_then_the_oldest_then_the_first(ids, ages, missed, winner):
-    merged = merge_meeting_tracks(tracks_at([[5.1, 6.0], [4.9, 6.2]], ids, ages, missed), 40)
-    assert merged.ids.tolist() == [winner]
+    tracks = tracks_at([[5.1, 6.0], [4.9, 6.2]], ids, ages, missed)
+    assert tracks.ids[one_per_pixel(tracks, np.ones(2, np.bool_), (40, 40))].tolist() == [winner]
+    assert one_per_pixel(tracks, np.array([False, True]), (40, 40)).tolist() == [False, True]
 
 
 def test_merging_keeps_the_order_and_all_that_do_not_meet(rng):
     pixels = rng.permutation(np.array([(u, v) for u in range(20) for v in range(15)], float))
-    merged = merge_meeting_tracks(tracks_at(pixels), 20)
-    np.testing.assert_array_equal(merged.ids, np.arange(300))
+    keep = rng.random(300) < 0.7
+    np.testing.assert_array_equal(one_per_pixel(tracks_at(pixels), keep, (15, 20)), keep)
 
 
 def test_no_tracks():

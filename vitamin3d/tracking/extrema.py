@@ -1,7 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """Local maxima of the curvature: the features of the method (Sec. 2.1)."""
 
-import cv2
 import numpy as np
 
 from vitamin3d._jit import inlined, kernel
@@ -9,30 +8,35 @@ from vitamin3d.config import ExtremaConfig
 from vitamin3d.types import Array
 
 CELL_PX = 32
-NEIGHBOURS = np.ones((3, 3), np.uint8)
 
 
 @kernel
-def _local_maxima(kappa, candidates, floor, border, out):  # type: ignore[no-untyped-def]
-    """Of the flat pixel indices `candidates`, those above `floor`, above their four earlier and not below their four
-    later neighbours; (u, v) into out, their number is returned."""
+def _mark_maxima(kappa, floor, border, is_maximum):  # type: ignore[no-untyped-def]
+    """Where kappa is above `floor`, above its four earlier and not below its four later neighbours; False in the border.
+
+    Without branches, so that it runs at SIMD speed.
+    """
     height, width = kappa.shape
-    count = 0
-    for i in candidates:
-        v, u = i // width, i % width
-        if v < border or u < border or v >= height - border or u >= width - border:
-            continue
-        k = kappa[v, u]
-        if not k > floor or k <= kappa[v, u - 1] or k < kappa[v, u + 1]:
-            continue
-        if k <= kappa[v - 1, u - 1] or k <= kappa[v - 1, u] or k <= kappa[v - 1, u + 1]:
-            continue
-        if k < kappa[v + 1, u - 1] or k < kappa[v + 1, u] or k < kappa[v + 1, u + 1]:
-            continue
-        out[count, 0] = u
-        out[count, 1] = v
-        count += 1
-    return count
+    is_maximum[:border, :] = False
+    is_maximum[height - border :, :] = False
+    for v in range(border, height - border):
+        for u in range(1, width - 1):  # from a constant: LLVM must see that no index is negative
+            k = kappa[v, u]
+            earlier = (k <= kappa[v - 1, u - 1]) | (k <= kappa[v - 1, u]) | (k <= kappa[v - 1, u + 1]) | (k <= kappa[v, u - 1])
+            later = (k < kappa[v, u + 1]) | (k < kappa[v + 1, u - 1]) | (k < kappa[v + 1, u]) | (k < kappa[v + 1, u + 1])
+            is_maximum[v, u] = (k > floor) & ~(earlier | later)
+        is_maximum[v, :border] = False
+        is_maximum[v, width - border :] = False
+
+
+@kernel
+def _list_marked(kappa, places, extrema, values):  # type: ignore[no-untyped-def]
+    """(u, v) of flat pixel indices and minus kappa there."""
+    width = kappa.shape[1]
+    for i in range(places.shape[0]):
+        v, u = places[i] // width, places[i] % width
+        extrema[i, 0], extrema[i, 1] = u, v
+        values[i] = -kappa[v, u]
 
 
 @inlined
@@ -73,11 +77,12 @@ def _occupy(pixels, radius, occupied):  # type: ignore[no-untyped-def]
 
 def detect_extrema(kappa: Array, config: ExtremaConfig) -> Array:
     """All local maxima (E, 2) int32 `u v` of kappa (H, W) above the noise floor, strongest first."""
-    candidates = np.flatnonzero(kappa >= cv2.dilate(kappa, NEIGHBOURS))  # the many that are none leave at SIMD speed
-    buffer = np.empty((len(candidates), 2), np.int32)
-    floor, border = np.float32(config.min_curvature), max(1, config.border_px)
-    extrema = buffer[: _local_maxima(kappa, candidates, floor, border, buffer)]
-    return extrema[np.argsort(-kappa[extrema[:, 1], extrema[:, 0]], kind="stable")]
+    is_maximum = np.empty(kappa.shape, np.bool_)
+    _mark_maxima(kappa, np.float32(config.min_curvature), max(1, config.border_px), is_maximum)
+    places = np.flatnonzero(is_maximum)
+    extrema, strengths = np.empty((len(places), 2), np.int32), np.empty(len(places), np.float32)
+    _list_marked(kappa, places, extrema, strengths)
+    return extrema[np.argsort(strengths, kind="stable")]
 
 
 def refine_extrema(kappa: Array, extrema: Array) -> Array:

@@ -50,6 +50,26 @@ def _climb_all(kappa, predicted, weight, sigma, max_steps, gate, out, out_kappa,
 
 
 @kernel
+def _keep_one_per_pixel(ids, pixels, ages, missed, width, keep, owner):  # type: ignore[no-untyped-def]
+    """Of the tracks to `keep` that share a pixel, clears all but one: a seen one before a coasting one, then the oldest, then
+    the lowest id. `owner` (pixels of the image,) comes as -1."""
+    for i in range(ids.shape[0]):
+        if not keep[i]:
+            continue
+        place = int(round(pixels[i, 1])) * width + int(round(pixels[i, 0]))
+        j = owner[place]
+        if j < 0:
+            owner[place] = i
+            continue
+        is_first = missed[i] < missed[j]
+        if missed[i] == missed[j]:
+            is_first = ages[i] > ages[j] or (ages[i] == ages[j] and ids[i] < ids[j])
+        keep[j if is_first else i] = False
+        if is_first:
+            owner[place] = i
+
+
+@kernel
 def _sample_flow(flow, reduction, pixels, out):  # type: ignore[no-untyped-def]
     """pixels + bilinear sample of flow (h, w, 2), both in its own pixels, `reduction` of the image's each; clamped."""
     height, width = flow.shape[:2]
@@ -91,18 +111,20 @@ def track_extrema(tracks: Tracks, predicted: Array, kappa: Array, config: Extrem
     pixels, values, found = np.empty((n, 2)), np.empty(n, np.float32), np.empty(n, np.bool_)
     weight, sigma = config.prediction_weight, config.prediction_sigma_px
     _climb_all(kappa, np.ascontiguousarray(predicted), weight, sigma, config.max_steps, config.gate_px, pixels, values, found)
-    missed = np.where(found, 0, tracks.missed + 1).astype(np.int32)
-    kept = np.where(found, values, tracks.kappa).astype(np.float32)
-    moved = Tracks(tracks.ids, np.where(found[:, None], pixels, predicted), kept, tracks.ages + np.int32(1), missed)
-    height, width = kappa.shape
-    inside = (pixels > 1).all(axis=1) & (pixels < [width - 2, height - 2]).all(axis=1)
-    return merge_meeting_tracks(moved.select((missed <= config.coast_frames) & inside), width)
+    missed = np.where(found, np.int32(0), tracks.missed + np.int32(1))
+    moved = Tracks(tracks.ids, pixels, np.where(found, values, tracks.kappa), tracks.ages + np.int32(1), missed)
+    u, v, (height, width) = pixels[:, 0], pixels[:, 1], kappa.shape
+    keep = (missed <= config.coast_frames) & (u > 1) & (v > 1) & (u < width - 2) & (v < height - 2)
+    return moved.select(one_per_pixel(moved, keep, kappa.shape))
 
 
-def merge_meeting_tracks(tracks: Tracks, width: int) -> Tracks:
-    """One track per pixel: a seen one before a coasting one, then the oldest, then the lowest id."""
-    place = np.rint(tracks.pixels).astype(np.int64) @ np.array([1, width])
-    order = np.lexsort((tracks.ids, -tracks.ages, tracks.missed, place))
-    first = np.ones(len(order), np.bool_)
-    first[1:] = place[order][1:] != place[order][:-1]
-    return tracks.select(np.sort(order[first]))
+def one_per_pixel(tracks: Tracks, keep: Array, shape: tuple[int, int]) -> Array:
+    """(N,) bool: `keep` (N,) with one track per pixel left: a seen one before a coasting one, then the oldest, then the lowest id.
+
+    Args:
+        tracks: those to keep lie in the picture.
+        shape: of the picture, (height, width).
+    """
+    kept, owner = keep.copy(), np.full(shape[0] * shape[1], -1, np.int32)
+    _keep_one_per_pixel(tracks.ids, tracks.pixels, tracks.ages, tracks.missed, shape[1], kept, owner)
+    return kept
