@@ -115,7 +115,7 @@ def track_extrema(tracks: Tracks, predicted: Array, kappa: Array, config: Extrem
     moved = Tracks(tracks.ids, pixels, np.where(found, values, tracks.kappa), tracks.ages + np.int32(1), missed)
     u, v, (height, width) = pixels[:, 0], pixels[:, 1], kappa.shape
     keep = (missed <= config.coast_frames) & (u > 1) & (v > 1) & (u < width - 2) & (v < height - 2)
-    return moved.select(one_per_pixel(moved, keep, kappa.shape))
+    return moved.select(one_per_pixel(moved, np.asarray(keep), (height, width)))
 
 
 def one_per_pixel(tracks: Tracks, keep: Array, shape: tuple[int, int]) -> Array:
@@ -127,4 +127,4 @@ def one_per_pixel(tracks: Tracks, keep: Array, shape: tuple[int, int]) -> Array:
     """
     kept, owner = keep.copy(), np.full(shape[0] * shape[1], -1, np.int32)
     _keep_one_per_pixel(tracks.ids, tracks.pixels, tracks.ages, tracks.missed, shape[1], kept, owner)
-    return kept
+    return np.asarray(kept)
