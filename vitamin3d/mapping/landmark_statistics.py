@@ -34,8 +34,8 @@ def _information(intrinsics, R, t, starts, obs_landmark, obs_valid, obs_pixels, 
 
 
 @kernel
-def _accumulate(intrinsics, R, t, centers, starts, obs_landmark, obs_valid, obs_pixels, first, points, count, squared, low, reference):  # type: ignore[no-untyped-def]
-    """Per landmark: observations, sum of squared errors, and the smallest cosine between a ray and its reference ray."""
+def _accumulate(intrinsics, R, t, starts, obs_landmark, obs_valid, obs_pixels, first, points, count, squared):  # type: ignore[no-untyped-def]
+    """Per landmark: observations that count, and the sum of their squared errors."""
     for k in range(R.shape[0]):
         for i in range(starts[k], starts[k + 1]):
             id_ = obs_landmark[i]
@@ -43,12 +43,24 @@ def _accumulate(intrinsics, R, t, centers, starts, obs_landmark, obs_valid, obs_
                 continue
             count[id_] += 1
             squared[id_] += squared_error(intrinsics, R[k], t[k], points[id_], obs_pixels[i])
+
+
+@kernel
+def _farthest_rays(centers, starts, obs_landmark, obs_valid, first, points, reference, low, farthest):  # type: ignore[no-untyped-def]
+    """Per landmark: the ray at the largest angle to its `reference` ray (the first one where that is NaN), and the angle's cosine."""
+    for k in range(centers.shape[0]):
+        for i in range(starts[k], starts[k + 1]):
+            id_ = obs_landmark[i]
+            if not obs_valid[i] or i < first[id_] or np.isnan(points[id_, 0]):
+                continue
             x, y, z = points[id_, 0] - centers[k, 0], points[id_, 1] - centers[k, 1], points[id_, 2] - centers[k, 2]
             norm = np.sqrt(x * x + y * y + z * z)
+            x, y, z = x / norm, y / norm, z / norm
             if np.isnan(reference[id_, 0]):
-                reference[id_, 0], reference[id_, 1], reference[id_, 2] = x / norm, y / norm, z / norm
-            cosine = (x * reference[id_, 0] + y * reference[id_, 1] + z * reference[id_, 2]) / norm
-            low[id_] = min(low[id_], cosine)
+                reference[id_, 0], reference[id_, 1], reference[id_, 2] = x, y, z
+            cosine = x * reference[id_, 0] + y * reference[id_, 1] + z * reference[id_, 2]
+            if cosine <= low[id_]:
+                low[id_], farthest[id_, 0], farthest[id_, 1], farthest[id_, 2] = cosine, x, y, z
 
 
 @dataclass(frozen=True)
@@ -60,22 +72,32 @@ class LandmarkStatistics:
     reprojection_rms_px: Array
     """(L,)."""
     parallax_deg: Array
-    """(L,) largest angle between the first ray and another."""
+    """(L,) the widest angle between two rays: between the one farthest from the first, and the one farthest from that."""
 
 
 def landmark_statistics(sparse_map: SparseMap, camera: Camera) -> LandmarkStatistics:
     """Observations, reprojection error and parallax of all landmarks."""
-    size = len(sparse_map.points_world)
-    count, squared, low = np.zeros(size, np.int32), np.zeros(size), np.ones(size)
-    poses = sparse_map.T_cam_world
-    centers = np.ascontiguousarray(inverse(poses)[:, :3, 3])
-    R, t = np.ascontiguousarray(poses[:, :3, :3]), np.ascontiguousarray(poses[:, :3, 3])
+    size, poses = len(sparse_map.points_world), sparse_map.T_cam_world
+    count, squared = np.zeros(size, np.int32), np.zeros(size)
+    starts, R, t = np.array(sparse_map.keyframe_starts), np.ascontiguousarray(poses[:, :3, :3]), np.ascontiguousarray(poses[:, :3, 3])
     _accumulate(
-        camera.intrinsics, R, t, centers, np.array(sparse_map.keyframe_starts), sparse_map.obs_landmark, sparse_map.obs_valid,
-        sparse_map.obs_pixels, sparse_map.first_observation, sparse_map.points_world, count, squared, low, np.full((size, 3), np.nan),
+        camera.intrinsics, R, t, starts, sparse_map.obs_landmark, sparse_map.obs_valid, sparse_map.obs_pixels,
+        sparse_map.first_observation, sparse_map.points_world, count, squared,
     )  # fmt: skip
-    parallax = np.degrees(np.arccos(np.clip(low, -1.0, 1.0)))
-    return LandmarkStatistics(count, np.sqrt(squared / np.maximum(count, 1)), parallax)
+    return LandmarkStatistics(count, np.sqrt(squared / np.maximum(count, 1)), _widest_angles(sparse_map))
+
+
+def _widest_angles(sparse_map: SparseMap) -> Array:
+    """(L,) degrees; see `LandmarkStatistics.parallax_deg`."""
+    size, centers = len(sparse_map.points_world), np.ascontiguousarray(inverse(sparse_map.T_cam_world)[:, :3, 3])
+    rays, starts = np.full((size, 3), np.nan), np.array(sparse_map.keyframe_starts)
+    for _ in range(2):
+        reference, rays, low = rays, np.full((size, 3), np.nan), np.ones(size)
+        _farthest_rays(
+            centers, starts, sparse_map.obs_landmark, sparse_map.obs_valid, sparse_map.first_observation, sparse_map.points_world,
+            reference, low, rays,
+        )  # fmt: skip
+    return np.asarray(np.degrees(np.arccos(np.clip(low, -1.0, 1.0))))
 
 
 def landmark_information(sparse_map: SparseMap, ids: Array, camera: Camera, config: SnapshotConfig) -> Array:
