@@ -32,6 +32,7 @@ from vitamin3d.benchmark.tables import PARTS
 from vitamin3d.bundle_adjustment.adjust import adjust_bundle
 from vitamin3d.bundle_adjustment.marginalization import CameraPrior
 from vitamin3d.bundle_adjustment.problem import BundleProblem
+from vitamin3d.commands.process import keep_freed_memory
 from vitamin3d.config import Config, live_config, load_toml, paper_config
 from vitamin3d.datasets import Dataset, Unreadable, open_dataset
 from vitamin3d.errors import InputError, Vitamin3dError
@@ -108,6 +109,7 @@ class Measured:
 def run_sparse(dataset: Dataset | Looped, frames: int, config: Config, with_rivals: bool, tell: Telling) -> Measured:
     """The sparse half, step by step; KLT and Schur in between where wanted."""
     cv2.setNumThreads(1)
+    keep_freed_memory()  # as the command line does
     others = StepTimes(clock=time.thread_time)
     made = Measured(FrontEnd(config), TimedSlam(dataset, config, others if with_rivals else None), others, [])
     made.front_end.times.clock = time.thread_time

@@ -21,6 +21,7 @@ from typing import Any
 import cv2
 import numpy as np
 
+from vitamin3d.commands.process import keep_freed_memory
 from vitamin3d.config import Config, load_toml, paper_config
 from vitamin3d.datasets import Dataset, Unreadable, open_dataset
 from vitamin3d.errors import InputError, Vitamin3dError
@@ -95,6 +96,7 @@ def klt_milliseconds(previous: Array, current: Array, pixels: Array, clock: Call
 def benchmark(dataset: Dataset, config: Config, frames: int | None) -> dict[str, Any]:
     """Medians in milliseconds per frame, ours by step, KLT's, and their ratio."""
     cv2.setNumThreads(1)
+    keep_freed_memory()  # as the command line does
     tracker, pictures = Tracker(config), readable(dataset, frames)
     previous = warmed_up(tracker, pictures)
     klt, points = [], []

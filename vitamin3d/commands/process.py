@@ -1,10 +1,15 @@
 # SPDX-License-Identifier: Apache-2.0
 """What all commands share: exit codes and the environment of the process."""
 
+import ctypes
 import os
+import sys
 
 EXIT_BROKEN, EXIT_ERROR, EXIT_NO_MAP, EXIT_INTERRUPTED = 1, 2, 3, 130
 ONE_THREAD_EACH = ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS")
+M_TRIM_THRESHOLD, M_MMAP_THRESHOLD = -1, -3
+"""Of malloc.h."""
+KEPT_BLOCK_BYTES, KEPT_BYTES = 32 << 20, 256 << 20
 
 
 def one_thread_each() -> None:
@@ -12,3 +17,12 @@ def one_thread_each() -> None:
     for name in ONE_THREAD_EACH:
         os.environ.setdefault(name, "1")
     os.environ.setdefault("OMP_WAIT_POLICY", "passive")
+
+
+def keep_freed_memory() -> None:
+    """Each frame needs the same few megabytes anew: tells glibc to keep what is freed instead of returning it to the system
+    (800 page faults a frame, a fifth of the front end's time). Elsewhere it does nothing."""
+    mallopt = getattr(ctypes.CDLL(None), "mallopt", None) if sys.platform == "linux" else None
+    if mallopt is not None:
+        mallopt(M_MMAP_THRESHOLD, KEPT_BLOCK_BYTES)
+        mallopt(M_TRIM_THRESHOLD, KEPT_BYTES)

@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from vitamin3d.commands.process import EXIT_INTERRUPTED, EXIT_NO_MAP, one_thread_each
+from vitamin3d.commands.process import EXIT_INTERRUPTED, EXIT_NO_MAP, keep_freed_memory, one_thread_each
 from vitamin3d.errors import InputError
 
 if TYPE_CHECKING:
@@ -56,6 +56,7 @@ def reconstruct(
 ) -> None:
     """Reconstruct a sequence: trajectory, cloud, meshes, depth and normal maps."""
     one_thread_each()
+    keep_freed_memory()
     from vitamin3d.job import Job, Selection
 
     voxels = _voxels(voxel_low, voxel_high, metric_scale, scale_from_ground_truth)
