@@ -75,8 +75,17 @@ def cloud_of_depth(folder: Path, dataset: Dataset, truth: Trajectory, times_ns: 
     if times_ns is not None and len(rows):
         near, _ = match_timestamps(np.array([maps[r].timestamp_ns for r in rows]), np.sort(times_ns), MATCH_TOLERANCE_NS)
         rows, poses = rows[near], poses[near]
-    parts = list(_back_projected([maps[r] for r in rows], truth.T_world_cam[poses], dataset.camera))
-    return thinned(np.concatenate(parts), VOXEL) if parts else None
+    return _together([maps[r] for r in rows], truth.T_world_cam[poses], dataset.camera) if len(rows) else None
+
+
+def _together(maps: list[DepthMap], T_world_cam: Array, camera: Camera) -> Array:
+    """`thinned` of the points of all maps, two of which need not be in memory at a time; InputError where there are none."""
+    lowest = [points.min(axis=0) for points in _back_projected(maps, T_world_cam, camera) if len(points)]
+    if not lowest:
+        raise InputError(f"{maps[0].path.parent}: no depth between {NEAR:g} and {FAR:g} m in any map; is its unit another?")
+    corner = np.min(lowest, axis=0)
+    sums = [_voxel_sums(points, corner, VOXEL) for points in _back_projected(maps, T_world_cam, camera)]
+    return _means(*_summed(*(np.concatenate(parts) for parts in zip(*sums, strict=True))))
 
 
 def _back_projected(maps: list[DepthMap], T_world_cam: Array, camera: Camera) -> Iterator[Array]:
@@ -86,7 +95,7 @@ def _back_projected(maps: list[DepthMap], T_world_cam: Array, camera: Camera) ->
     for depth, T in zip(maps, T_world_cam, strict=True):
         z = read_depth(depth, camera)[v, u]
         good = (z > NEAR) & (z < FAR) & np.isfinite(rays[:, 0])
-        yield thinned(transform_points(T, rays[good] * z[good, None]), VOXEL / 2)
+        yield transform_points(T, rays[good] * z[good, None])
 
 
 def reference_points(path: Path) -> Array:
@@ -95,14 +104,24 @@ def reference_points(path: Path) -> Array:
 
 
 def thinned(points: Array, voxel: float) -> Array:
-    """The mean of the points of each voxel."""
-    keys = voxel_keys(points, voxel)
+    """The mean of the points of each voxel; the lowest coordinates lie in the middle of theirs, as Open3D has it."""
+    return _means(*_voxel_sums(points, points.min(axis=0), voxel)) if len(points) else points
+
+
+def _voxel_sums(points: Array, lowest: Array, voxel: float) -> tuple[Array, Array]:
+    """Keys (V,) of the voxels, and the sum and number (V, 4) of their points."""
+    return _summed(voxel_keys(points - lowest + voxel / 2, voxel), np.column_stack([points, np.ones(len(points))]))
+
+
+def _summed(keys: Array, rows: Array) -> tuple[Array, Array]:
+    """Each key once, and the sum of its rows."""
     order = np.argsort(keys, kind="stable")
-    first = np.flatnonzero(np.diff(keys[order], prepend=keys[order][:1] - 1)) if len(points) else np.zeros(0, np.int64)
-    if len(first) == 0:
-        return points
-    counts = np.diff(np.append(first, len(points)))
-    return np.asarray(np.add.reduceat(points[order], first, axis=0) / counts[:, None])
+    first = np.flatnonzero(np.diff(keys[order], prepend=keys[order][:1] - 1))
+    return keys[order][first], np.add.reduceat(rows[order], first, axis=0) if len(first) else rows
+
+
+def _means(_: Array, sums: Array) -> Array:
+    return np.asarray(sums[:, :3] / sums[:, 3:])
 
 
 def voxel_keys(points: Array, voxel: float) -> Array:

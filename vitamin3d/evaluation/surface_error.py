@@ -54,18 +54,21 @@ class SurfaceErrors:
 
 
 def sample_surface(geometry: Geometry, count: int = SAMPLES, seed: int = 0) -> Array:
-    """Points (N, 3) that stand for it: those of a cloud; of a mesh, `count` spread evenly by area."""
+    """Points (N, 3) that stand for it: those of a cloud; of a mesh, `count` independent ones by area, as Open3D draws them.
+
+    Points spread more evenly than that would leave fewer gaps and so a completion 3 % smaller than that of the usual scripts.
+    """
     if not geometry.is_mesh:
         return geometry.points
-    a, b, c = (geometry.points[geometry.triangles[:, k]] for k in range(3))
-    areas = 0.5 * np.linalg.norm(np.cross(b - a, c - a), axis=1)
-    if not areas.sum() > 0:
+    if not surface_area(geometry) > 0:
         raise InputError("a mesh without area; export it again")
-    rng = np.random.default_rng(seed)
-    places = np.cumsum(areas) / areas.sum()
-    k = np.searchsorted(places, (np.arange(count) + rng.random(count)) / count).clip(max=len(areas) - 1)
-    u, v = np.sqrt(rng.random(count)), rng.random(count)
-    return np.asarray((1 - u)[:, None] * a[k] + (u * (1 - v))[:, None] * b[k] + (u * v)[:, None] * c[k])
+    import open3d as o3d
+
+    mesh = o3d.geometry.TriangleMesh(
+        o3d.utility.Vector3dVector(geometry.points), o3d.utility.Vector3iVector(geometry.triangles.astype(np.int32))
+    )
+    o3d.utility.random.seed(seed)
+    return np.array(mesh.sample_points_uniformly(count).points)
 
 
 def surface_area(geometry: Geometry) -> float:

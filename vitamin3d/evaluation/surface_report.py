@@ -79,13 +79,13 @@ def _observed(run: Run, dataset: Dataset, folder: Path, points: Array, truth: Tr
 def surface_lines(report: dict[str, Any]) -> list[str]:
     """The figures for people."""
     seen = report["observed"]
-    head = f"{'surface [cm]':26}{'median':>8}{'< 5 cm':>8}{'compl. 5/10 cm':>16}{'chamfer':>9}{'RMSE acc./compl./chamfer':>27}"
+    head = f"{'surface [cm]':31}{'median':>8}{'< 5 cm':>8}{'compl. 5/10 cm':>16}{'chamfer':>9}{'RMSE acc./compl./chamfer':>27}"
     lines = ["", f"surface  reference: {report['reference']['points']} points of {report['reference']['origin']}"]
     lines += [f"         observed by keyframes: {seen['points']} points, {seen['how']}", head]
     for kind in ("mesh", "cloud"):
         for name, label in (("all", "all, after ICP"), ("observed_by_keyframes", "observed, trajectories")):
             if kind in report:
-                lines.append(f"{kind + ', ' + label:26}" + _figures(report[kind][name]))
+                lines.append(f"{kind + ', ' + label:31}" + _figures(report[kind][name]))
     return lines
 
 
