@@ -85,7 +85,8 @@ def test_threads_are_known_to_one_file():
 
 
 def test_heavy_libraries_are_imported_where_they_are_used():
-    assert all(name.startswith(("dense/", "exporters/")) for name in importers("open3d"))
+    sampling = "evaluation/surface_error.py"  # whose samples are to be those of other people's scripts
+    assert all(name.startswith(("dense/", "exporters/")) or name == sampling for name in importers("open3d"))
     assert all(name.startswith("dense/") for name in importers("pymeshlab"))
     for path in FILES:
         at_import = [node for node in tree(path).body if not isinstance(node, (ast.FunctionDef, ast.ClassDef))]

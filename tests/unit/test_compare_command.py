@@ -196,12 +196,23 @@ def test_a_stray_point_is_an_error_unless_it_may_be_left_out(run, other, command
     assert items_of(run / "comparison")[1]["orbslam3/demo"]["strays"] == 1
 
 
+def test_a_stray_point_of_a_scan_is_an_error_too(run, other, command, tmp_path):
+    np.savetxt(tmp_path / "scan.xyz", np.vstack([sample_surface(read_geometry(DEMO / "scene.ply"), 20_000), [[2000.0, 0, 0]]]))
+    for name, rest in (("evaluate", ()), ("compare", (other,))):
+        arguments = (name, run, *rest, "-g", DEMO, "--reference", tmp_path / "scan.xyz", "-o", tmp_path / name)
+        error = command(*arguments).error
+        assert "scan.xyz: 1 points" in error and "--drop-strays" in error and not (tmp_path / name).exists()
+        told = command(*arguments, "--drop-strays")
+        assert told.code == 0 and told.err.startswith("warning: ") and "scan.xyz: 1 points" in told.err
+
+
 def test_clocks_that_do_not_overlap_are_said(run, other, command):
     lines = (other / "KeyFrameTrajectory.txt").read_text().splitlines()
     (other / "KeyFrameTrajectory.txt").write_text(
         "\n".join(f"{float(line.split()[0]) - 1.7e9:.6f} {line.split(' ', 1)[1]}" for line in lines)
     )
-    assert "no overlap in time" in command("compare", run, other).error
+    error = command("compare", run, other).error
+    assert "no overlap in time" in error and "KeyFrameTrajectory.txt covers" in error
 
 
 @pytest.fixture

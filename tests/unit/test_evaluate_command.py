@@ -235,6 +235,14 @@ def test_a_truth_of_the_body_is_recognised_and_corrected(demo, tmp_path, figures
     assert (told["truth"]["frame"], told["truth"]["uncorrected_rmse"]) == ("camera", None)
 
 
+def test_who_says_that_the_truth_is_of_the_camera_is_believed_and_warned(demo, tmp_path, figures):
+    rig = body_rig(demo, tmp_path)
+    files = (rig / "camera.tum", "-g", rig / "body.tum", "--calibration", rig / "sensor.yaml")
+    found, corrected = figures(*files, "--truth-frame", "camera"), figures(*files)
+    assert found["truth"]["frame"] == "camera" and found["truth"]["frame_remark"].startswith("warning: ")
+    assert found["ate"]["Sim(3)"]["rmse"] == pytest.approx(corrected["truth"]["uncorrected_rmse"], rel=1e-9)
+
+
 def test_an_estimate_of_the_body_is_compared_with_the_body(demo, tmp_path, figures):
     rig = body_rig(demo, tmp_path)
     found = figures(rig / "body.tum", "-g", rig / "body.tum", "--calibration", rig / "sensor.yaml", "--truth-frame", "body")
@@ -290,6 +298,7 @@ def test_missing_sources_and_truths_are_one_line(out, command, tmp_path):
         (lambda f: [*f[:4], *(f"{3 * float(v):.6f}" for v in f[4:])], "not of length 1"),
         (lambda f: [f[0], "nan", *f[2:]], "must be finite"),
         (lambda f: [f[0], "0", "0", "0", *f[4:]], "all positions are the same"),
+        (lambda f: [f[0], *(f"{float(v) * 1e300:g}" for v in f[1:4]), *f[4:]], "cannot be reckoned with"),
         (lambda f: f[1:], "7 numbers per line"),
         (lambda f: ["hello", "world"], "not a trajectory"),
         (lambda f: [f"{float(f[0]) + 0.025:.9f}", *f[1:]], "match within 20 ms"),
@@ -302,6 +311,25 @@ def test_bad_trajectories_are_one_line(out, demo, change, words, command, tmp_pa
     error = command("evaluate", out, "-g", tmp_path / "truth.tum").error
     assert words in error and "trajectory.tum" in error
     assert not (out / "evaluation").exists()
+
+
+@pytest.mark.parametrize(
+    ("change", "words"),
+    [
+        (lambda f: [*f[:4], f[7], *f[4:7]], "order w x y z"),
+        (lambda f: [f[0], "1", "2", "3", *f[4:]], "all positions are the same"),
+    ],
+)
+def test_bad_truths_are_one_line_that_names_them(out, demo, change, words, command, tmp_path):
+    write_tum(demo.ground_truth(), tmp_path / "truth.tum")
+    rewritten(tmp_path / "truth.tum", change)
+    error = command("evaluate", out, "-g", tmp_path / "truth.tum").error
+    assert words in error and "truth.tum" in error and "trajectory.tum" not in error
+
+
+@pytest.mark.parametrize("offset", ["nan", "inf", "1e12", "-5e9"])
+def test_offsets_that_no_clock_has_are_one_line(out, offset, command):
+    assert "--time-offset" in command("evaluate", out, "-g", DEMO, "--time-offset", offset).error
 
 
 def test_an_empty_trajectory_is_one_line(out, command):

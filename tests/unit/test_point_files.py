@@ -112,6 +112,9 @@ def test_a_cloud_that_really_is_long_keeps_its_end(rng):
     [
         ("empty.ply", HEAD % (b"ascii", 0, XYZ.encode()), "empty cloud"),
         ("empty.xyz", b"", "empty cloud"),
+        ("nothing.ply", b"", "empty cloud"),
+        ("scale_zero.xyz", b"1 2 3\n" * 5, "all points are the same"),
+        ("two.xyz", b"1 2 3\n4 5 6\n", "2 of its 2 points"),
         ("no.ply", b"hello", "not a PLY"),
         ("flat.ply", HEAD % (b"ascii", 1, b"property float x\n") + b"1\n", "x, y and z"),
         ("odd.ply", HEAD % (b"ascii", 1, b"property half x\n") + b"1\n", "damaged"),

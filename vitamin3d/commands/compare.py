@@ -8,9 +8,11 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 from vitamin3d.commands.process import one_thread_each
+from vitamin3d.commands.strays import say_strays
 
 if TYPE_CHECKING:
     from vitamin3d.datasets import Dataset
+    from vitamin3d.evaluation.comparison import Item
     from vitamin3d.evaluation.finished_run import Truth
     from vitamin3d.types import Array
 
@@ -37,7 +39,7 @@ def compare(
     """Compare with other systems: density, voxels, accuracy, completeness, coverage, and a picture side by side."""
     one_thread_each()
     from vitamin3d.evaluation.comparison import compare as compared
-    from vitamin3d.evaluation.comparison import read_other, read_own
+    from vitamin3d.evaluation.comparison import read_geometry_as, read_other, read_own
     from vitamin3d.evaluation.comparison_text import markdown, picture
     from vitamin3d.evaluation.evaluation_files import make_folder
     from vitamin3d.evaluation.evaluation_text import without_nan
@@ -46,12 +48,11 @@ def compare(
     from vitamin3d.exporters.rendering import jpeg
 
     finished, own, items = read_run(run), read_own(run), [read_other(spec) for spec in others]
+    scan = None if reference is None else read_geometry_as("reference", reference)
     dataset = read_sequence(ground_truth, source, calibration)
     truth = read_truth(TruthRequest(ground_truth, source, calibration), dataset)
-    surface = _reference(reference, source or ground_truth, dataset, truth)
-    for item in (*own, *items):
-        if item.geometry.strays:
-            _say_strays(item.path, item.geometry.strays, drop_strays)
+    say_strays([*own, *items, *([scan] if scan else [])], drop_strays)
+    surface = _reference(scan, source or ground_truth, dataset, truth)
     report, placed = compared(own, items, truth, surface)
     is_metric = truth is not None or bool(finished.stats["scale"]["known"])
     report = {"run": str(run), "unit": "metre" if is_metric else "map unit", "ours": own[-1].name, **report}
@@ -67,25 +68,15 @@ def compare(
     typer.echo(made["comparison.json"].decode() if json else text + "\n" + "\n".join(f"  {folder / name}" for name in made), nl=not json)
 
 
-def _say_strays(path: Path, count: int, are_dropped: bool) -> None:
-    """A warning where they may be left out, else an error: one point at 2 km spoils every figure."""
-    from vitamin3d.errors import InputError
-
-    what = f"{path}: {count} points are not finite or far from all others"
-    if not are_dropped:
-        raise InputError(f"{what}; clean the cloud, or leave them out with --drop-strays")
-    typer.echo(f"warning: {what}; left out", err=True)
-
-
-def _reference(path: Path | None, folder: Path | None, dataset: "Dataset | None", truth: "Truth | None") -> "Array | None":
+def _reference(scan: "Item | None", folder: Path | None, dataset: "Dataset | None", truth: "Truth | None") -> "Array | None":
     """Points of the true surface: of a file, or of the sequence's depth maps."""
     from vitamin3d.errors import InputError
     from vitamin3d.evaluation.reference_surface import cloud_of_depth, reference_points
 
-    if path is not None:
+    if scan is not None:
         if truth is None:
-            raise InputError(f"{path}: a true surface needs a ground truth of the trajectory in the same world; give --ground-truth")
-        return reference_points(path)
+            raise InputError(f"{scan.path}: a true surface needs a ground truth of the trajectory in the same world; give --ground-truth")
+        return reference_points(scan.geometry)
     camera: Any = None if dataset is None else dataset.ground_truth()
     if folder is None or dataset is None or camera is None:
         return None

@@ -8,11 +8,15 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 from vitamin3d.commands.process import one_thread_each
+from vitamin3d.commands.strays import say_strays
 from vitamin3d.errors import InputError
 
 if TYPE_CHECKING:
     from vitamin3d.datasets import Dataset
     from vitamin3d.evaluation.finished_run import Run, Truth
+
+LONGEST_OFFSET_S = 4e9
+"""More than the time since 1970; beyond twice of it nanoseconds do not fit into 64 bits."""
 
 
 class Format(str, Enum):
@@ -46,6 +50,7 @@ def evaluate(
     reference: Annotated[
         Path | None, typer.Option(help="Score mesh and cloud against this scanner's cloud or mesh (EuRoC's data.ply).")
     ] = None,
+    drop_strays: Annotated[bool, typer.Option("--drop-strays", help="Leave out points that are NaN or far from all others.")] = False,
     out: Annotated[Path | None, typer.Option("--out", "-o", help="Folder for JSON, table and plots; default: RUN/evaluation.")] = None,
     json: Annotated[bool, typer.Option("--json", help="Print JSON instead of the table.")] = False,
 ) -> None:
@@ -63,10 +68,10 @@ def evaluate(
     request = TruthRequest(ground_truth, source, calibration, format.value if format else None, times, frame)
     finished = read_run(run, times=times)
     truth = read_truth(request, dataset)
-    offset_ns = round(time_offset * 1e9)
+    offset_ns = _nanoseconds(time_offset)
     report = figures(finished, truth, dataset, offset_ns)
     if surface or reference is not None:
-        report["surface"] = _surface(finished, truth, dataset, source or ground_truth, reference)
+        report["surface"] = _surface(finished, truth, dataset, source or ground_truth, reference, drop_strays)
     folder = out or (run / "evaluation" if run.is_dir() else None)
     typer.echo(as_json(report) if json else table(report), nl=not json)
     if folder is not None:
@@ -77,14 +82,27 @@ def evaluate(
             typer.echo("\n" + "\n".join(f"  {path}" for path in written))
 
 
-def _surface(run: "Run", truth: "Truth | None", dataset: "Dataset | None", folder: Path | None, reference: Path | None) -> dict[str, Any]:
+def _nanoseconds(offset_s: float) -> int:
+    if not abs(offset_s) <= LONGEST_OFFSET_S:
+        raise InputError(f"--time-offset {offset_s:g}: give seconds between -{LONGEST_OFFSET_S:g} and {LONGEST_OFFSET_S:g}")
+    return round(offset_s * 1e9)
+
+
+def _surface(
+    run: "Run", truth: "Truth | None", dataset: "Dataset | None", folder: Path | None, reference: Path | None, drop_strays: bool
+) -> dict[str, Any]:
+    from vitamin3d.evaluation.comparison import read_geometry_as, read_own
     from vitamin3d.evaluation.surface_report import surface_report
 
     if truth is None or dataset is None or folder is None:
         raise InputError(
             "a surface is scored in the world of the true trajectory; give the sequence's folder as --ground-truth or --source"
         )
-    report = surface_report(run, truth, dataset, folder, reference)
+    if not run.path.is_dir():
+        raise InputError(f"{run.path}: a surface needs the folder of a finished run, not a trajectory alone")
+    own, scan = read_own(run.path), None if reference is None else read_geometry_as("reference", reference)
+    say_strays([*own, *([scan] if scan else [])], drop_strays)
+    report = surface_report(run, own, truth, dataset, folder, scan)
     if report is None:
         raise InputError(f"{folder}: no depth maps (depth0/, depth.txt, frame-*.depth.png); give --reference with a true cloud or mesh")
     return report

@@ -47,6 +47,8 @@ def read_geometry(path: Path) -> Geometry:
     Raises:
         InputError: the file cannot be read, is of another kind, cut short, or holds no finite point.
     """
+    if path.is_file() and path.stat().st_size == 0:
+        raise InputError(f"{path}: an empty file, so an empty cloud; give a file with points")
     reader = {".ply": _read_ply, ".pcd": _read_pcd, ".obj": _read_obj}.get(path.suffix.lower(), _read_text)
     try:
         data = path.read_bytes()
@@ -65,7 +67,11 @@ def without_strays(geometry: Geometry, path: Path) -> Geometry:
     """The geometry less what is not finite and points far from all others: one point at 2 km hides a room."""
     finite: Array = np.asarray(np.isfinite(geometry.points).all(axis=1))
     if finite.sum() < 3:
-        raise InputError(f"{path}: only {finite.sum()} of {len(geometry.points)} points are finite numbers; export it again")
+        raise InputError(
+            f"{path}: {finite.sum()} of its {len(geometry.points)} points are finite numbers, three are needed; export it again"
+        )
+    if (geometry.points[finite] == geometry.points[finite][0]).all():
+        raise InputError(f"{path}: all points are the same; was it exported with a scale of zero?")
     distance = np.linalg.norm(geometry.points - np.median(geometry.points[finite], axis=0), axis=1)
     far = finite & (distance > FAR * max(float(np.percentile(distance[finite], 90)), 1e-12))
     keep: Array = finite & ~far if far.sum() <= MOST_STRAYS * finite.sum() else finite

@@ -32,6 +32,7 @@ class Item:
     path: Path
     geometry: Geometry
     trajectory: Trajectory | None = None
+    trajectory_file: Path | None = None
 
 
 @dataclass(frozen=True)
@@ -67,11 +68,17 @@ class Placed:
 
 def read_own(run: Path) -> list[Item]:
     """The cloud and the fine mesh of a finished run; InputError where it has neither."""
-    trajectory = read_trajectory(run / "trajectory.tum").trajectory if run.is_dir() else None
-    items = [Item(f"ours: {kind}", run / name, read_geometry(run / name), trajectory) for kind, name in OWN if (run / name).is_file()]
+    file = run / "trajectory.tum"
+    trajectory = read_trajectory(file).trajectory if run.is_dir() else None
+    items = [Item(f"ours: {kind}", run / name, read_geometry(run / name), trajectory, file) for kind, name in OWN if (run / name).is_file()]
     if not items:
         raise InputError(f"{run}: neither cloud.ply nor mesh_high.ply; give the folder of a finished run")
     return [item for item in items if len(item.geometry.points)]
+
+
+def read_geometry_as(name: str, path: Path) -> Item:
+    """A cloud or mesh that needs no placing."""
+    return Item(name, path, read_geometry(path))
 
 
 def read_other(spec: str) -> Item:
@@ -82,7 +89,7 @@ def read_other(spec: str) -> Item:
     """
     if "," in spec and not Path(spec).exists():
         first, second = (_existing(Path(part)) for part in spec.split(",", 1))
-        return Item(_name(first), first, read_geometry(first), read_trajectory(second).trajectory)
+        return Item(_name(first), first, read_geometry(first), read_trajectory(second).trajectory, second)
     path = _existing(Path(spec))
     if path.is_file():
         return Item(_name(path), path, read_geometry(path))
@@ -92,7 +99,9 @@ def read_other(spec: str) -> Item:
         if len(others) != 1:
             raise InputError(f"{path}: no cloud under a usual name ({', '.join(CLOUDS[:4])}, ...); give the file")
         cloud = others[0]
-    return Item(_name(path), cloud, read_geometry(cloud), None if trajectory is None else read_trajectory(trajectory).trajectory)
+    return Item(
+        _name(path), cloud, read_geometry(cloud), None if trajectory is None else read_trajectory(trajectory).trajectory, trajectory
+    )
 
 
 def _existing(path: Path) -> Path:
@@ -145,7 +154,7 @@ def by_trajectory(item: Item, truth: Truth | None, world: Trajectory | None) -> 
     if item.trajectory is None or world is None or (truth is None and item.trajectory is world):
         return ITSELF
     target = truth if truth is not None else Truth(world, "our run")
-    paired = pair(Run(item.path, item.trajectory, {}), target)
+    paired = pair(Run(item.trajectory_file or item.path, item.trajectory, {}), target)
     s, R, t = alignment_between(paired.estimate, paired.truth, Alignment.SIM3)
     errors = summarize(absolute_errors(paired.estimate, paired.truth, Alignment.SIM3))
     return Placement("trajectory", s, R, t, {"matched_poses": errors.count, "ate_rmse": errors.rmse})

@@ -124,7 +124,7 @@ def _truth_of_folder(folder: Path, dataset: Dataset | None, T_body_cam: Array | 
     if states is not None and states.is_file():
         return Truth(read_trajectory(states, "euroc").trajectory, str(states), frame or TruthFrame.BODY, T_body_cam)
     own = None if dataset is None else dataset.ground_truth()
-    return None if own is None else Truth(own, f"{folder}", frame or TruthFrame.CAMERA, T_body_cam)
+    return None if own is None else Truth(own, f"{folder}", frame, T_body_cam)
 
 
 def extrinsics(source: Path | None, calibration: Path | None) -> Array | None:

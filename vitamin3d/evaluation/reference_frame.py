@@ -24,6 +24,8 @@ LEAST_TURN_DEG = 2.0
 """RMS of the compared turns below which rotations tell nothing."""
 LEAST_PATH = 0.05
 """RMS distance of the true positions from their mean, metres, below which no similarity can be fitted."""
+LEAST_SPREAD = 1e-9
+"""The same, below which the positions are one."""
 UNRELATED, CLEARLY = 0.5, 0.5
 """Relative residual above which turns have nothing in common, and by which a better explanation must be better."""
 SAME_WORLD_DEG = 5.0
@@ -70,22 +72,29 @@ def residual(estimated: Array, true: Array, R_true_est: Array) -> float:
     return float(np.sqrt(((true - estimated @ R_true_est.T) ** 2).sum() / max(1e-18, (true**2).sum())))
 
 
-def check_quaternion_order(estimate: Trajectory, truth: Trajectory, T_body_cam: Array | None, name: str) -> None:
-    """InputError where the estimate's turns are not the truth's, but are when its quaternions are read with w first.
+def check_quaternion_order(estimate: Trajectory, truth: Trajectory, T_body_cam: Array | None, names: tuple[str, str]) -> None:
+    """InputError where the estimate's turns are not the truth's, but are when the quaternions of either are read with w first.
 
     Args:
         estimate, truth: paired by row.
         T_body_cam: (4, 4), where it is known: either may be of the body.
-        name: of the file with the estimate.
+        names: of the files with the estimate and the truth.
     """
     pairs = spread_pairs(len(estimate))
     true = turns(truth, pairs)
     if _rms_deg(true) < LEAST_TURN_DEG:
         return
     R = np.eye(3) if T_body_cam is None else T_body_cam[:3, :3]
-    as_is, swapped = (min(residual(turns(x, pairs), true, F) for F in (np.eye(3), R, R.T)) for x in (estimate, _with_w_first(estimate)))
-    if as_is > UNRELATED and swapped < CLEARLY * UNRELATED:
-        raise InputError(f"{name}: the quaternions are in the order w x y z (or the truth's are); TUM has x y z w: swap the columns")
+
+    def misfit(a: Trajectory, b: Trajectory) -> float:
+        return min(residual(turns(a, pairs), turns(b, pairs), F) for F in (np.eye(3), R, R.T))
+
+    if misfit(estimate, truth) <= UNRELATED:
+        return
+    swapped = (misfit(_with_w_first(estimate), truth), misfit(estimate, _with_w_first(truth)))
+    if min(swapped) < CLEARLY * UNRELATED:
+        name = names[int(np.argmin(swapped))]
+        raise InputError(f"{name}: the quaternions are in the order w x y z; TUM has x y z w: swap the columns")
 
 
 def _with_w_first(trajectory: Trajectory) -> Trajectory:
@@ -116,7 +125,7 @@ def recognise_frame(estimate: Trajectory, truth: Trajectory, T_body_cam: Array |
         estimate: of the camera; one of the body is recognised and compared with the body.
         truth: as the file has it, paired by row with the estimate.
         T_body_cam: (4, 4) of the calibration; None: not known.
-        declared: what the format or the user says; None: nothing.
+        declared: what the format or the user says; None: nothing. Only the user says CAMERA, and is believed.
 
     Raises:
         InputError: the truth is of the body, and T_body_cam is not known.
@@ -129,6 +138,10 @@ def recognise_frame(estimate: Trajectory, truth: Trajectory, T_body_cam: Array |
     as_is, moved = (_misfit(estimate, candidate) for candidate in (truth, in_camera))
     certain = max(as_is, moved) > 0 and min(as_is, moved) < CLEARLY * max(as_is, moved)
     is_body = moved < as_is if certain else declared is TruthFrame.BODY
+    if is_body and certain and declared is TruthFrame.CAMERA:
+        return FrameFinding(
+            TruthFrame.CAMERA, True, "warning: said to be of the camera and taken as it is, but the truth turns as the body does"
+        )
     if not is_body and declared is TruthFrame.BODY:
         remark = "the truth is said to be of the body, but it and the estimate are of one frame: not moved"
         return FrameFinding(TruthFrame.CAMERA, certain, remark)
@@ -174,8 +187,12 @@ def _rms_deg(rotation_vectors: Array) -> float:
 
 def can_be_aligned(estimate: Trajectory, truth: Trajectory) -> bool:
     """False where the camera hardly moved, so that a similarity would be fitted to noise."""
-    spreads = [np.sqrt(((x := t.T_world_cam[:, :3, 3]) - x.mean(axis=0)).var(axis=0).sum()) for t in (estimate, truth)]
-    return bool(spreads[1] >= LEAST_PATH and spreads[0] > 1e-9)
+    return spread(truth) >= LEAST_PATH and spread(estimate) > LEAST_SPREAD
+
+
+def spread(trajectory: Trajectory) -> float:
+    """RMS distance of the positions from their mean."""
+    return float(np.sqrt(trajectory.T_world_cam[:, :3, 3].var(axis=0).sum()))
 
 
 def _as_it_is(estimate: Trajectory, truth: Trajectory) -> tuple[float, float]:

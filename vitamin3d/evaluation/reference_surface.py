@@ -10,7 +10,7 @@ import numpy as np
 
 from vitamin3d.datasets import Dataset
 from vitamin3d.datasets.image_folder import natural_key
-from vitamin3d.datasets.point_files import read_geometry
+from vitamin3d.datasets.point_files import Geometry
 from vitamin3d.datasets.tables import nanoseconds_from_seconds, rows_of
 from vitamin3d.errors import InputError
 from vitamin3d.evaluation.surface_error import sample_surface
@@ -98,9 +98,9 @@ def _back_projected(maps: list[DepthMap], T_world_cam: Array, camera: Camera) ->
         yield transform_points(T, rays[good] * z[good, None])
 
 
-def reference_points(path: Path) -> Array:
+def reference_points(scan: Geometry) -> Array:
     """Points (M, 3) of a scanner's cloud or of a mesh, thinned; metres."""
-    return thinned(sample_surface(read_geometry(path), 2_000_000), VOXEL)
+    return thinned(sample_surface(scan, 2_000_000), VOXEL)
 
 
 def thinned(points: Array, voxel: float) -> Array:

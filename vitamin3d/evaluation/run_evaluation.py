@@ -10,12 +10,14 @@ from vitamin3d.datasets import Dataset
 from vitamin3d.errors import InputError
 from vitamin3d.evaluation.finished_run import Run, Truth
 from vitamin3d.evaluation.reference_frame import (
+    LEAST_SPREAD,
     FrameFinding,
     TruthFrame,
     can_be_aligned,
     check_quaternion_order,
     moved_into_camera,
     recognise_frame,
+    spread,
 )
 from vitamin3d.evaluation.track_statistics import TrackStatistics, poses_at, track_statistics
 from vitamin3d.evaluation.trajectory_error import (
@@ -47,6 +49,7 @@ INTERVALS_S = (1, 5, 10, 30)
 """Seconds; those longer than the trajectory are left out."""
 SAME_FRAME_NS = 1_000_000
 LEAST_MATCHES = 3
+FARTHEST_POSITION = 1e12
 
 
 @dataclass(frozen=True)
@@ -100,13 +103,23 @@ def pair(run: Run, truth: Truth, offset_ns: int = 0) -> Pairing:
     a, b = matched(estimate, truth.trajectory)
     if len(a) < LEAST_MATCHES:
         raise _no_match(run, truth, estimate, len(a))
-    check_quaternion_order(a, b, truth.T_body_cam, str(run.trajectory_file))
+    _check_positions(a, str(run.trajectory_file), b, truth.origin)
+    check_quaternion_order(a, b, truth.T_body_cam, (str(run.trajectory_file), truth.origin))
     finding = recognise_frame(a, b, truth.T_body_cam, truth.declared)
     if finding.frame is TruthFrame.BODY and truth.T_body_cam is not None:
         b = moved_into_camera(b, truth.T_body_cam)
-    if can_be_aligned(b, b) and not can_be_aligned(a, b):
-        raise InputError(f"{run.trajectory_file}: all positions are the same, so no scale can be found; a camera that moves is needed")
     return Pairing(a, b, finding)
+
+
+def _check_positions(estimate: Trajectory, estimate_name: str, truth: Trajectory, truth_name: str) -> None:
+    """InputError where one of them has no size, or none that can be reckoned with, while the other moves."""
+    both = ((estimate_name, estimate, truth), (truth_name, truth, estimate))
+    for name, trajectory, _ in both:
+        if np.abs(trajectory.T_world_cam[:, :3, 3]).max() > FARTHEST_POSITION:
+            raise InputError(f"{name}: a position beyond {FARTHEST_POSITION:g} cannot be reckoned with; check the columns")
+    for name, trajectory, other in both:
+        if can_be_aligned(other, other) and spread(trajectory) <= LEAST_SPREAD:
+            raise InputError(f"{name}: all positions are the same, so no scale can be found; a camera that moves is needed")
 
 
 def _no_match(run: Run, truth: Truth, estimate: Trajectory, count: int) -> InputError:

@@ -9,8 +9,7 @@ import numpy as np
 
 from vitamin3d.datasets import Dataset
 from vitamin3d.datasets.trajectories import read_tum
-from vitamin3d.errors import InputError
-from vitamin3d.evaluation.comparison import by_trajectory, place, read_own
+from vitamin3d.evaluation.comparison import Item, by_trajectory, place
 from vitamin3d.evaluation.finished_run import Run, Truth
 from vitamin3d.evaluation.reference_surface import cloud_of_depth, depth_maps, observed_by, reference_points
 from vitamin3d.evaluation.run_evaluation import pair
@@ -22,29 +21,30 @@ LEAST_KEYFRAMES = 0.5
 """Share of the keyframes that must have depth maps of their own, for these to be the reference."""
 
 
-def surface_report(run: Run, truth: Truth, dataset: Dataset, folder: Path, reference: Path | None) -> dict[str, Any] | None:
+def surface_report(
+    run: Run, own: list[Item], truth: Truth, dataset: Dataset, folder: Path, reference: Item | None
+) -> dict[str, Any] | None:
     """All figures of the run's cloud and mesh; None where the sequence has no depth maps and no reference is given.
 
     Args:
+        own: the run's cloud and mesh.
         truth: of the trajectory, in the reference's world, metres.
         folder: of the sequence, for its depth maps.
         reference: a scanner's cloud or a mesh.
 
     Raises:
-        InputError: the run is a bare trajectory, or a file cannot be read.
+        InputError: a file cannot be read.
     """
-    if not run.path.is_dir():
-        raise InputError(f"{run.path}: a surface needs the folder of a finished run, not a trajectory alone")
     of_camera = Trajectory(*_true_poses(run, truth))
-    points = reference_points(reference) if reference is not None else cloud_of_depth(folder, dataset, of_camera)
+    points = reference_points(reference.geometry) if reference is not None else cloud_of_depth(folder, dataset, of_camera)
     if points is None:
         return None
     observed, how = _observed(run, dataset, folder, points, of_camera, reference is None)
     report: dict[str, Any] = {
-        "reference": {"origin": str(reference or folder), "points": len(points)},
+        "reference": {"origin": str(folder if reference is None else reference.path), "points": len(points)},
         "observed": {"points": len(observed), "how": how},
     }
-    for item in read_own(run.path):
+    for item in own:
         placement = by_trajectory(item, truth, truth.trajectory)
         by_keyframes = place(item, placement, None)
         report[item.name.removeprefix("ours: ")] = {
