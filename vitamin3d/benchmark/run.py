@@ -2,7 +2,7 @@
 """A whole benchmark: finds the sequences, runs what is not finished, writes tables and figures."""
 
 import json
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -17,10 +17,12 @@ from vitamin3d.datasets import open_dataset
 from vitamin3d.evaluation.comparison import TRAJECTORIES
 from vitamin3d.evaluation.evaluation_files import make_folder
 from vitamin3d.evaluation.evaluation_text import without_nan
-from vitamin3d.evaluation.finished_run import TruthRequest, read_run, read_truth
-from vitamin3d.evaluation.run_evaluation import evaluate
+from vitamin3d.evaluation.finished_run import Run, TruthRequest, read_run, read_truth
+from vitamin3d.evaluation.run_evaluation import LEAST_MATCHES, SAME_FRAME_NS, evaluate
+from vitamin3d.evaluation.trajectory_error import success_rate
 from vitamin3d.exporters.files import write_file
 from vitamin3d.exporters.report import thinned_rows
+from vitamin3d.types import Trajectory
 
 
 @dataclass(frozen=True)
@@ -64,22 +66,36 @@ def _job(plan: Plan, name: str, path: Path) -> SequenceJob:
 
 
 def _peers(folder: Path | None, job: SequenceJob) -> dict[str, dict[str, Any]]:
-    """What other systems made of the same sequence, scored as ours."""
+    """What other systems made of the same pictures, scored as ours; a system that localised hardly any of them is left out."""
     found = {}
     for system in sorted(folder.iterdir()) if folder is not None and folder.is_dir() else []:
         path = next((p for name in TRAJECTORIES if (p := system / job.name / name).is_file()), None)
         if path is not None:
             source = Path(job.source)
             dataset = open_dataset(source)
-            report = evaluate(read_run(path), read_truth(TruthRequest(source), dataset), dataset)
+            times = dataset.timestamps_ns[: _max_frames(job.options)]
+            run = _until(read_run(path), int(times[-1]))
+            if len(run.estimate) < LEAST_MATCHES:
+                continue
+            report = evaluate(run, read_truth(TruthRequest(source), dataset), dataset)
             series = np.column_stack([report["chronological"]["seconds"], report["chronological"]["error"]])
             ate = report["ate"][report["alignment"]]["rmse"]
             found[system.name] = {
-                "success_rate": report["success_rate"],
+                "success_rate": success_rate(report["localised"], len(times)),
                 "ate": ate,
                 "chronological": thinned_rows(series, CHRONOLOGY).tolist(),
             }
     return found
+
+
+def _max_frames(options: tuple[str, ...]) -> int | None:
+    return int(options[options.index("--max-frames") + 1]) if "--max-frames" in options else None
+
+
+def _until(run: Run, last_ns: int) -> Run:
+    """The run without its poses after a moment."""
+    kept = run.estimate.timestamps_ns <= last_ns + SAME_FRAME_NS
+    return replace(run, estimate=Trajectory(run.estimate.timestamps_ns[kept], run.estimate.T_world_cam[kept]))
 
 
 def _write(plan: Plan, sequences: list[Sequence]) -> list[Path]:
