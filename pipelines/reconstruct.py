@@ -41,9 +41,11 @@ def main(argv: list[str] | None = None) -> int:
     output.write_config(config)
     output.write_trajectories(slam.trajectory(), slam.keyframe_trajectory(), scale)
     output.write_cloud(point_cloud(slam.map, slam.camera, config.cloud, config.snapshot), scale, "")
-    output.write_surfaces(*reconstruction.surfaces(), scale, reconstruction.voxel_lengths(), reconstruction.filter_remark)
+    empty = output.write_surfaces(*reconstruction.surfaces(), scale, reconstruction.voxel_lengths(), reconstruction.filter_remark)
     print(f"{len(slam.trajectory())} of {len(dataset)} frames localised, {slam.map.num_keyframes} keyframes: {output.path}")
-    return 0
+    if empty:
+        print(f"no surface: {', '.join(empty)}", file=sys.stderr)
+    return 1 if "mesh_high" in empty else 0
 
 
 if __name__ == "__main__":

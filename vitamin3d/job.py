@@ -166,6 +166,7 @@ class _JobRun:
         times = [self.front_end.times, self.slam.times, *([dense.reconstruction.times] if dense.reconstruction else [])]
         stats = run_statistics(self.slam, self.record, scale, cloud_points, times, self.watch)
         stats |= {"source": self.dataset.name, "mode": self.job.config.mode, "voxels": dense.voxels(), "volumes": dense.volumes()}
+        stats |= {"empty_meshes": dense.empty_meshes}
         stats |= {"skipped": [_line(s) for s in self.record.skipped], "failure": str(failure) if failure else None}
         stats |= {"live": live_table(self.record, dense.mesh_lags) if self.job.live else None}
         self.output.write_stats(stats)
@@ -229,6 +230,8 @@ class _Dense:
         self.reconstruction: Reconstruction | None = None
         self.num_moved = 0
         """Views that were fused anew because their keyframe had moved."""
+        self.empty_meshes = ["mesh_low", "mesh_high"]
+        """Names of those without a triangle, which are not written."""
         self.mesh_lags: list[float] = []
         """Seconds from when a keyframe's picture was due until it was in the volume; where there is a clock."""
 
@@ -316,7 +319,7 @@ class _Dense:
             self.reconstruction.forget_waiting()
         if self.reconstruction.median_depths:
             dense = self.reconstruction
-            self.output.write_surfaces(*dense.surfaces(), self.scale, dense.voxel_lengths(), dense.filter_remark)
+            self.empty_meshes = self.output.write_surfaces(*dense.surfaces(), self.scale, dense.voxel_lengths(), dense.filter_remark)
 
     def voxels(self) -> dict[str, float] | None:
         """Sides of the voxels in the unit of the output."""

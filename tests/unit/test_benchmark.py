@@ -145,6 +145,13 @@ def test_trials_are_scored_and_lightened(finished):
     assert not (Path(job.folder) / "trial_1" / "mesh_high.ply").exists()
 
 
+def test_a_trial_without_a_surface_is_scored(tmp_path):
+    (tmp_path / "strict.toml").write_text("[surface]\nmin_component_triangles = 100000000\n")
+    options = (*OPTIONS, "--config", str(tmp_path / "strict.toml"))
+    (result,) = run_sequence(SequenceJob("a", str(demo_copy(tmp_path / "a")), str(tmp_path / "out"), 1, options))
+    assert result["exit_code"] == 1 and 1e-5 < result["ate"]["Sim(3)"] < 0.01
+
+
 def test_finished_trials_are_not_run_again_and_broken_files_are(finished, monkeypatch):
     job, results = finished
     times = [result_file(job, seed).stat().st_mtime_ns for seed in range(2)]

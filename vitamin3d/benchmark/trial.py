@@ -22,7 +22,7 @@ from vitamin3d.evaluation.run_evaluation import evaluate
 from vitamin3d.exporters.files import write_file
 from vitamin3d.exporters.report import thinned_rows
 
-NO_MAP, BAD_INPUT = 3, 2
+NO_MAP, BAD_INPUT, BROKEN = 3, 2, 1
 HEAVY = ("depth/*.png", "normals/*.png", "mesh_high.obj", "mesh_high.mtl", "mesh_low.ply", "tracks.npz")
 """Files of a trial that are removed once it is scored, but for its first one, unless all are to be kept."""
 REMEMBERED = ("success_rate", "frames", "processed_frames", "keyframes", "cpu_seconds", "peak_memory_mb", "steps")
@@ -86,19 +86,26 @@ def _run(job: SequenceJob, seed: int) -> dict[str, Any]:
     last = (done.stderr.strip().splitlines() or [""])[-1].removeprefix("vitamin3d: ")
     if done.returncode == BAD_INPUT:
         raise InputError(f"{job.name}: {last}")
-    if done.returncode not in (0, NO_MAP):
+    if done.returncode not in (0, NO_MAP) and not _lacks_only_a_surface(done.returncode, out):
         raise TrialFailed(f"{job.name}, trial {seed}: the process ended with {done.returncode} {last}")
     seconds, stats = round(time.monotonic() - begun, 1), json.loads((out / "stats.json").read_text())
     result = {
         "sequence": job.name, "source": job.source, "options": list(job.options), "seed": seed, "seconds": seconds,
         "exit_code": done.returncode, "retries": stats["initialization_retries"], "points": stats["cloud_points"],
         **{name: stats[name] for name in REMEMBERED},
-        **(_errors(job, out) if done.returncode == 0 and truth is not None else {}),
+        **(_errors(job, out) if done.returncode != NO_MAP and truth is not None else {}),
     }  # fmt: skip
     if not job.keep_all:
         _lighten(out, HEAVY if seed == 0 else (*HEAVY, "mesh_high.ply", "report.html"))
     write_file(result_file(job, seed), [(json.dumps(without_nan(result)) + "\n").encode()])
     return result
+
+
+def _lacks_only_a_surface(code: int, out: Path) -> bool:
+    """No step broke, but no triangle came out: the trajectory is scored all the same."""
+    path = out / "stats.json"
+    stats = json.loads(path.read_text()) if code == BROKEN and path.is_file() else {}
+    return bool(stats.get("empty_meshes")) and stats.get("failure") is None
 
 
 def _errors(job: SequenceJob, out: Path) -> dict[str, Any]:

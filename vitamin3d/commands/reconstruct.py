@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from vitamin3d.commands.process import EXIT_INTERRUPTED, EXIT_NO_MAP, keep_freed_memory, one_thread_each
+from vitamin3d.commands.process import EXIT_BROKEN, EXIT_INTERRUPTED, EXIT_NO_MAP, keep_freed_memory, one_thread_each
 from vitamin3d.errors import InputError
 
 if TYPE_CHECKING:
@@ -155,7 +155,17 @@ def _conclude(outcome: "Outcome", out: Path) -> int:
     for name in ("mesh_high.ply", "mesh_high.obj", "mesh_low.ply", "cloud.ply", "trajectory.tum"):
         if (out / name).exists():
             typer.echo(f"  {out / name}")
-    return EXIT_INTERRUPTED if outcome.record.interrupted else 0
+    if outcome.record.interrupted:
+        return EXIT_INTERRUPTED
+    return _say_empty_meshes(stats["empty_meshes"])
+
+
+def _say_empty_meshes(names: list[str]) -> int:
+    """A line about meshes without a triangle; the exit code, which is that of a broken step where the fine one is empty."""
+    if names:
+        remedy = "see surface.min_component_triangles and fusion.max_relative_deviation (`vitamin3d config`), or move the camera more"
+        typer.echo(f"vitamin3d: no surface: {' and '.join(f'{n}.ply' for n in names)} would be empty, so not written; {remedy}", err=True)
+    return EXIT_BROKEN if "mesh_high" in names else 0
 
 
 def _calibration_line(given: dict[str, float], used: dict[str, float], path: Path) -> str:

@@ -119,15 +119,22 @@ class OutputFolder:
         """`cloud.ply`."""
         write_cloud_ply(scale.cloud(cloud), self.path / "cloud.ply", [_program(), scale.remark, filter_remark])
 
-    def write_surfaces(self, low: Surface, high: Surface, scale: Scale, voxels: tuple[float, float], filter_remark: str = "") -> None:
-        """`mesh_low.ply`, `mesh_high.ply` and `mesh_high.obj`; voxels in map units."""
+    def write_surfaces(self, low: Surface, high: Surface, scale: Scale, voxels: tuple[float, float], filter_remark: str = "") -> list[str]:
+        """`mesh_low.ply`, `mesh_high.ply` and `mesh_high.obj`; voxels in map units.
+
+        Returns:
+            Names of those without a triangle, which are not written.
+        """
         for name, surface, voxel in (("mesh_low", low, voxels[0]), ("mesh_high", high, voxels[1])):
             comments = [_program(), scale.remark, f"TSDF voxels of {voxel * scale.metres_per_unit:.6g} {scale.unit}", filter_remark]
             comments = [comment for comment in comments if comment]
+            if not len(surface.triangles):
+                continue
             scaled = scale.surface(surface)
             write_ply(scaled, self.path / f"{name}.ply", comments)
             if name == "mesh_high":
                 write_obj(scaled, self.path / f"{name}.obj", comments)
+        return [name for name, surface in (("mesh_low", low), ("mesh_high", high)) if not len(surface.triangles)]
 
     def write_calibration(self, camera: Camera, remark: str) -> None:
         """`calibration.yaml`: the camera that was used, for --calibration."""
