@@ -5,7 +5,7 @@
     python tools/export_mesh.py OUT --mesh low --format obj --simplify 50000 --output small.obj
 
 PLY and OBJ keep the map's frame (that of the first camera: x right, y down, z forward). GLB is turned upright, y up, as
-glTF wants it. `--simplify` and `--fill-holes` use pymeshlab, which is under the GPL and is imported for these options only.
+glTF wants it. `--fill-holes` uses pymeshlab, which is under the GPL and is imported for this option only.
 """
 
 import argparse
@@ -17,7 +17,7 @@ import numpy as np
 
 from vitamin3d.dense.surface_extraction import vertex_normals
 from vitamin3d.errors import DependencyError, InputError, OutputError, Vitamin3dError
-from vitamin3d.exporters.mesh import read_ply, write_obj, write_ply
+from vitamin3d.exporters.mesh import read_comments, read_ply, write_obj, write_ply
 from vitamin3d.types import Surface
 
 GLTF_FROM_MAP = np.array([1.0, -1.0, -1.0])
@@ -36,9 +36,12 @@ def parsed(argv: list[str] | None) -> argparse.Namespace:
 
 def export(arguments: argparse.Namespace) -> Path:
     """Reads, simplifies, writes; the path of the new file."""
-    surface = read_ply(arguments.out / f"mesh_{arguments.mesh}.ply")
+    source = arguments.out / f"mesh_{arguments.mesh}.ply"
+    surface = read_ply(source)
+    if not len(surface.triangles):
+        raise InputError(f"{source}: an empty mesh; reconstruct again")
     path, kind = _target(arguments)
-    comments = [f"vitamin3d: {arguments.mesh} mesh, {len(surface.triangles)} triangles before export"]
+    comments = [*read_comments(source), f"exported from {source.name}, which has {len(surface.triangles)} triangles"]
     if arguments.fill_holes is not None:
         surface = filled(surface, arguments.fill_holes)
     if arguments.simplify is not None:
@@ -56,14 +59,24 @@ def _target(arguments: argparse.Namespace) -> tuple[Path, str]:
 
 
 def simplified(surface: Surface, max_triangles: int) -> Surface:
-    """The surface with at most so many triangles, by quadric edge collapse; colours stay with the vertices that stay."""
+    """The surface with at most so many triangles, by Open3D's quadric edge collapse.
+
+    Pymeshlab's, which keeps every edge of the many borders of a mesh from pictures, misses such numbers and bends the rest.
+    """
     if max_triangles < 1:
         raise InputError(f"--simplify: must be positive, not {max_triangles}")
     if len(surface.triangles) <= max_triangles:
         return surface
-    meshes = _mesh_set(surface, "--simplify")
-    meshes.meshing_decimation_quadric_edge_collapse(targetfacenum=max_triangles, preservenormal=True, preserveboundary=True)
-    return _surface(meshes)
+    import open3d as o3d
+
+    mesh = o3d.geometry.TriangleMesh(o3d.utility.Vector3dVector(surface.vertices_world), o3d.utility.Vector3iVector(surface.triangles))
+    mesh.vertex_colors = o3d.utility.Vector3dVector(surface.colors / 255.0)
+    mesh = mesh.simplify_quadric_decimation(max_triangles).remove_unreferenced_vertices()
+    vertices, triangles = np.array(mesh.vertices), np.array(mesh.triangles, np.int32)
+    if not 0 < len(triangles) <= max_triangles:
+        raise InputError(f"--simplify {max_triangles}: {len(triangles)} triangles would be left; choose another number")
+    colors = np.rint(255.0 * np.clip(np.array(mesh.vertex_colors), 0.0, 1.0)).astype(np.uint8)
+    return Surface(vertices, triangles, vertex_normals(vertices, triangles), colors)
 
 
 def filled(surface: Surface, max_edges: int) -> Surface:

@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 
 from vitamin3d.dense.surface_extraction import vertex_normals
+from vitamin3d.dense.tsdf_fusion import empty_surface
 from vitamin3d.exporters.mesh import read_cloud_ply, read_ply, write_cloud_ply, write_ply
 from vitamin3d.types import PointCloud, Surface
 
@@ -33,7 +34,7 @@ def run(tmp_path):
     colors = np.tile(np.array([[200, 100, 50]], np.uint8), (len(vertices), 1))
     surface = Surface(vertices, triangles.astype(np.int32), vertex_normals(vertices, triangles), colors)
     for name in ("mesh_high.ply", "mesh_low.ply"):
-        write_ply(surface, tmp_path / name, [])
+        write_ply(surface, tmp_path / name, ["lengths in metres"])
     (tmp_path / "keyframes.tum").write_text("".join(f"{k}.000000001 0 0 {0.1 * k} 0 0 0 1\n" for k in range(1, 4)))
     (tmp_path / "depth").mkdir()
     (tmp_path / "depth" / "canvas.yaml").write_text(
@@ -53,10 +54,29 @@ def test_every_format_can_be_opened(run, kind, capsys):
     assert path == run / f"mesh_high_export.{kind}" and len(mesh.triangles) == 2 * (SIDE - 1) ** 2
     assert np.abs(np.asarray(mesh.vertex_colors) - np.array([200, 100, 50]) / 255).max() < 0.01
     assert np.sign(np.asarray(mesh.vertices)[:, 2].mean()) == (-1 if kind == "glb" else 1)
+    assert kind == "glb" or b"lengths in metres" in path.read_bytes()[:400]
+
+
+def test_an_empty_mesh_is_not_exported(run, capsys):
+    write_ply(empty_surface(), run / "mesh_high.ply", [])
+    assert tool("export_mesh").main([str(run)]) == 2
+    assert "empty mesh" in capsys.readouterr().err and not (run / "mesh_high_export.ply").exists()
+
+
+def test_simplified_meshes_with_many_borders_reach_the_number_and_keep_their_shape(run):
+    """As meshes from pictures are: a tenth of the triangles is missing."""
+    whole = read_ply(run / "mesh_high.ply")
+    torn = whole.triangles[np.random.default_rng(0).random(len(whole.triangles)) > 0.1]
+    write_ply(Surface(whole.vertices_world, torn, whole.normals_world, whole.colors), run / "mesh_high.ply", [])
+    assert tool("export_mesh").main([str(run), "--simplify", "400", "--output", str(run / "small.ply")]) == 0
+    small = read_ply(run / "small.ply")
+    assert 200 < len(small.triangles) <= 400
+    assert np.abs(small.vertices_world[:, 2] - 2 - 0.05 * np.sin(5 * small.vertices_world[:, 0])).max() < 0.03
+    edges = np.sort(small.triangles[:, [0, 1, 1, 2, 2, 0]].reshape(-1, 2), axis=1)
+    assert np.unique(edges, axis=0, return_counts=True)[1].max() == 2, "no edge has three triangles"
 
 
 def test_simplified_meshes_keep_shape_and_colour(run):
-    pytest.importorskip("pymeshlab")
     assert tool("export_mesh").main([str(run), "--simplify", "400", "--output", str(run / "small.ply")]) == 0
     small = read_ply(run / "small.ply")
     assert 200 < len(small.triangles) <= 400

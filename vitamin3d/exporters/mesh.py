@@ -115,6 +115,13 @@ def read_ply(path: Path) -> Surface:
     return Surface(points.astype(np.float64), faces["vertex_indices"].astype(np.int32), normals.astype(np.float64), colors)
 
 
+def read_comments(path: Path) -> list[str]:
+    """The comments of a PLY's header: scale, voxels, filter and version, as `write_ply` got them."""
+    with path.open("rb") as file:
+        header = file.read(10_000).partition(b"end_header\n")[0]
+    return [line[8:] for line in header.decode("ascii", "replace").splitlines() if line.startswith("comment ")]
+
+
 def _element_count(lines: list[str], name: str) -> int:
     """Number of elements that a header declares; 0 where it declares none."""
     words = next((line.split() for line in lines if line.startswith(f"element {name} ")), [])
