@@ -89,6 +89,14 @@ def local_maxima(kappa, floor, border):
     return found
 
 
+def roundness(kappa, u, v):
+    """4 det / trace² of the matrix of second derivatives, from the nine samples."""
+    window = np.asarray(kappa, float)[v - 1 : v + 2, u - 1 : u + 2]
+    second, cross = np.array([1.0, -2.0, 1.0]), np.array([-0.5, 0.0, 0.5])
+    hessian = np.array([[window[1] @ second, cross @ window @ cross], [cross @ window @ cross, window[:, 1] @ second]])
+    return 4 * np.linalg.det(hessian) / np.trace(hessian) ** 2
+
+
 def parabola_maximum(below, center, above):
     """Of the parabola through (-1, below), (0, center), (1, above), clipped to half a pixel."""
     a, b, _ = np.polyfit([-1, 0, 1], [below, center, above], 2)

@@ -54,6 +54,8 @@ class ExtremaConfig:
 
     min_curvature: float = 0.15
     """Noise floor of kappa, grey levels³ per pixel⁴ of the smoothed 0–255 image."""
+    min_roundness: float = 0.6
+    """4 det / trace² of kappa's Hessian at the maximum: on a ridge (0) it slides, on a round hill (1) it stays; 0: all maxima."""
     max_tracks: int = 5300
     refill_interval: int = 1
     """Frames between two refills with free extrema."""
@@ -90,6 +92,8 @@ class ExtremaTrackingConfig:
     max_steps: int = 10
     gate_px: float = 1.05
     """A climb that ends farther from the prediction is a miss: where the flow is exact, a far extremum is another one."""
+    min_roundness: float = 0.4
+    """As of the extrema; a climb that ends on a maximum less round is a miss."""
     coast_frames: int = 2
     """Frames in a row that a track may live on its prediction."""
 
@@ -540,7 +544,8 @@ def paper_config() -> Config:
     return Config(
         mode="paper",
         curvature=CurvatureConfig(smoothing_sigma_px=2.5),
-        extrema_tracking=ExtremaTrackingConfig(prediction="dominant_flow", gate_px=8.0, coast_frames=0),
+        extrema=ExtremaConfig(min_roundness=0.0),
+        extrema_tracking=ExtremaTrackingConfig(prediction="dominant_flow", gate_px=8.0, min_roundness=0.0, coast_frames=0),
         localization=LocalizationConfig(prior_inlier_ratio=2.0, outlier_medians=100.0),
         recovery=RecoveryConfig(enabled=False),
         relocalization=RelocalizationConfig(enabled=False),

@@ -79,7 +79,8 @@ def test_the_paper_differs_where_the_paper_does():
     assert paper.mode == "paper" and paper.extrema_tracking.prediction == "dominant_flow"
     assert not paper.recovery.enabled and paper.window.anchors == 0
     assert paper.bundle_adjustment.keyframe_solver == "subspace"
-    same = ("dominant_flow", "initialization", "triangulation", "nltgv", "extrema")
+    assert paper.extrema.min_roundness == paper.extrema_tracking.min_roundness == 0.0  # "all extrema"
+    same = ("dominant_flow", "initialization", "triangulation", "nltgv")
     assert all(getattr(paper, group) == getattr(Config(), group) for group in same)
 
 

@@ -6,9 +6,9 @@ from scenes import texture
 
 from vitamin3d.config import CurvatureConfig, ExtremaConfig
 from vitamin3d.tracking.curvature import curvature
-from vitamin3d.tracking.extrema import CELL_PX, detect_extrema, refine_extrema, select_free_extrema, subpixel_offset
+from vitamin3d.tracking.extrema import CELL_PX, detect_extrema, refine_extrema, roundness, select_free_extrema, subpixel_offset
 
-LOW = ExtremaConfig(min_curvature=0.0, border_px=1)
+LOW = ExtremaConfig(min_curvature=0.0, border_px=1, min_roundness=0.0)
 
 
 def as_set(extrema):
@@ -44,7 +44,7 @@ def test_nan_is_never_a_maximum(rng):
 
 def test_strongest_come_first_and_floor_and_border_hold(rng):
     kappa = curvature(texture(90, 120, rng), CurvatureConfig())
-    config = ExtremaConfig(min_curvature=0.5, border_px=9)
+    config = ExtremaConfig(min_curvature=0.5, border_px=9, min_roundness=0.0)
     found = detect_extrema(kappa, config)
     values = kappa[found[:, 1], found[:, 0]]
     assert len(found) > 30
@@ -52,6 +52,29 @@ def test_strongest_come_first_and_floor_and_border_hold(rng):
     assert found.min() >= 9 and (found < [120 - 9, 90 - 9]).all()
     assert found.dtype == np.int32
     assert as_set(found) == reference.local_maxima(kappa, 0.5, 9)
+
+
+def test_roundness_is_that_of_the_hessian(rng):
+    kappa = rng.standard_normal((30, 30)).astype(np.float32)
+    for u, v in rng.integers(1, 29, (50, 2)):
+        assert roundness(kappa, u, v) == pytest.approx(reference.roundness(kappa, u, v), rel=1e-4, abs=1e-5)
+
+
+@pytest.mark.parametrize("angle", [0.0, 0.4, np.pi / 4])
+def test_roundness_of_a_quadric_is_that_of_its_axes(angle):
+    v, u = np.mgrid[-3:4, -3:4].astype(float)
+    along, across = u * np.cos(angle) + v * np.sin(angle), v * np.cos(angle) - u * np.sin(angle)
+    for axes in ((1.0, 1.0), (1.0, 0.25), (1.0, 0.0)):
+        kappa = 50 - axes[0] * across**2 - axes[1] * along**2
+        assert roundness(kappa, 3, 3) == pytest.approx(4 * axes[0] * axes[1] / sum(axes) ** 2, abs=1e-9)
+
+
+def test_maxima_on_ridges_are_left_out(rng):
+    kappa = curvature(texture(90, 120, rng), CurvatureConfig())
+    found = as_set(detect_extrema(kappa, ExtremaConfig(min_curvature=0.5, border_px=9, min_roundness=0.7)))
+    every = reference.local_maxima(kappa, 0.5, 9)
+    assert found == {(u, v) for u, v in every if reference.roundness(kappa, u, v) >= 0.7}
+    assert 20 < len(found) < len(every)
 
 
 def test_a_flat_picture_has_no_extrema():

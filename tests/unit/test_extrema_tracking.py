@@ -20,6 +20,7 @@ from vitamin3d.tracking.extrema_tracking import (
 from vitamin3d.types import DominantFlow, Tracks
 
 CONFIG = ExtremaTrackingConfig()
+ANY_SHAPE = dataclasses.replace(CONFIG, min_roundness=0.0)
 
 
 def tracks_at(pixels, ids=None, ages=None, missed=None):
@@ -32,12 +33,12 @@ def climbed(kappa, predicted, config):
     n = len(predicted)
     out, values, found = np.empty((n, 2)), np.empty(n, np.float32), np.empty(n, np.bool_)
     weight, sigma = config.prediction_weight, config.prediction_sigma_px
-    _climb_all(kappa, predicted, weight, sigma, config.max_steps, config.gate_px, out, values, found)
+    _climb_all(kappa, predicted, weight, sigma, config.max_steps, config.gate_px, config.min_roundness, out, values, found)
     return out, values, found
 
 
 @pytest.mark.parametrize("shape", [(3, 3), (3, 30), (25, 31)])
-@pytest.mark.parametrize("config", [CONFIG, dataclasses.replace(CONFIG, gate_px=8.0, max_steps=2, prediction_weight=2.0)])
+@pytest.mark.parametrize("config", [ANY_SHAPE, dataclasses.replace(ANY_SHAPE, gate_px=8.0, max_steps=2, prediction_weight=2.0)])
 def test_climbing_equals_its_twin(rng, shape, config):
     kappa = rng.standard_normal(shape).astype(np.float32)
     predicted = rng.uniform(-2, [shape[1] + 1, shape[0] + 1], (200, 2))
@@ -53,8 +54,9 @@ def test_climbing_equals_its_twin(rng, shape, config):
 def test_the_prediction_pulls_at_an_even_ridge():
     kappa = np.zeros((21, 41), np.float32)
     kappa[10] = 1.0
-    out, _, found = climbed(kappa, np.array([[17.0, 10.0], [30.2, 10.0]]), CONFIG)
-    assert found.all()
+    predicted = np.array([[17.0, 10.0], [30.2, 10.0]])
+    out, _, found = climbed(kappa, predicted, ANY_SHAPE)
+    assert found.all() and not climbed(kappa, predicted, CONFIG)[2].any()
     np.testing.assert_allclose(out, [[17, 10], [30, 10]], atol=0.5)
 
 

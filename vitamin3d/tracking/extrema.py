@@ -29,14 +29,30 @@ def _mark_maxima(kappa, floor, border, is_maximum):  # type: ignore[no-untyped-d
         is_maximum[v, width - border :] = False
 
 
+@inlined
+def roundness(kappa, u, v):  # type: ignore[no-untyped-def]
+    """4 det / trace² of the Hessian of kappa at a pixel: 1 at the top of a round hill, 0 on a ridge, whose top slides along it.
+
+    Above 1 or negative nowhere on a maximum; NaN where kappa is flat.
+    """
+    uu = kappa[v, u + 1] - 2.0 * kappa[v, u] + kappa[v, u - 1]
+    vv = kappa[v + 1, u] - 2.0 * kappa[v, u] + kappa[v - 1, u]
+    uv = 0.25 * (kappa[v + 1, u + 1] - kappa[v + 1, u - 1] - kappa[v - 1, u + 1] + kappa[v - 1, u - 1])
+    return 4.0 * (uu * vv - uv * uv) / ((uu + vv) * (uu + vv))
+
+
 @kernel
-def _list_marked(kappa, places, extrema, values):  # type: ignore[no-untyped-def]
-    """(u, v) of flat pixel indices and minus kappa there."""
-    width = kappa.shape[1]
+def _list_marked(kappa, places, min_roundness, extrema, strengths):  # type: ignore[no-untyped-def]
+    """(u, v) of those flat pixel indices that are round enough, and minus kappa there; their number is returned."""
+    width, count = kappa.shape[1], 0
     for i in range(places.shape[0]):
         v, u = places[i] // width, places[i] % width
-        extrema[i, 0], extrema[i, 1] = u, v
-        values[i] = -kappa[v, u]
+        if min_roundness > 0.0 and not roundness(kappa, u, v) >= min_roundness:
+            continue
+        extrema[count, 0], extrema[count, 1] = u, v
+        strengths[count] = -kappa[v, u]
+        count += 1
+    return count
 
 
 @inlined
@@ -76,13 +92,13 @@ def _occupy(pixels, radius, occupied):  # type: ignore[no-untyped-def]
 
 
 def detect_extrema(kappa: Array, config: ExtremaConfig) -> Array:
-    """All local maxima (E, 2) int32 `u v` of kappa (H, W) above the noise floor, strongest first."""
+    """The local maxima (E, 2) int32 `u v` of kappa (H, W) above the noise floor that are round enough, strongest first."""
     is_maximum = np.empty(kappa.shape, np.bool_)
     _mark_maxima(kappa, np.float32(config.min_curvature), max(1, config.border_px), is_maximum)
     places = np.flatnonzero(is_maximum)
     extrema, strengths = np.empty((len(places), 2), np.int32), np.empty(len(places), np.float32)
-    _list_marked(kappa, places, extrema, strengths)
-    return extrema[np.argsort(strengths, kind="stable")]
+    count = _list_marked(kappa, places, config.min_roundness, extrema, strengths)
+    return extrema[np.argsort(strengths[:count], kind="stable")]
 
 
 def refine_extrema(kappa: Array, extrema: Array) -> Array:

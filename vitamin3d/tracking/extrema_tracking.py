@@ -5,7 +5,7 @@ import numpy as np
 
 from vitamin3d._jit import inlined, kernel
 from vitamin3d.config import ExtremaTrackingConfig
-from vitamin3d.tracking.extrema import subpixel_offset
+from vitamin3d.tracking.extrema import roundness, subpixel_offset
 from vitamin3d.types import Array, DominantFlow, Tracks
 
 
@@ -31,8 +31,8 @@ def climb(kappa, u, v, predicted_u, predicted_v, weight, squared_sigma, max_step
 
 
 @kernel
-def _climb_all(kappa, predicted, weight, sigma, max_steps, gate, out, out_kappa, found):  # type: ignore[no-untyped-def]
-    """Climbs from each prediction (N, 2); `found` where a positive maximum lies within `gate` of it."""
+def _climb_all(kappa, predicted, weight, sigma, max_steps, gate, min_roundness, out, out_kappa, found):  # type: ignore[no-untyped-def]
+    """Climbs from each prediction (N, 2); `found` where a positive maximum, round enough, lies within `gate` of it."""
     height, width = kappa.shape
     for i in range(predicted.shape[0]):
         pu, pv = predicted[i, 0], predicted[i, 1]
@@ -42,6 +42,8 @@ def _climb_all(kappa, predicted, weight, sigma, max_steps, gate, out, out_kappa,
             continue
         u, v, is_maximum = climb(kappa, u, v, pu, pv, weight, sigma * sigma, max_steps)
         if not is_maximum or not kappa[v, u] > 0.0:
+            continue
+        if min_roundness > 0.0 and not roundness(kappa, u, v) >= min_roundness:
             continue
         x = u + subpixel_offset(kappa[v, u - 1], kappa[v, u], kappa[v, u + 1])
         y = v + subpixel_offset(kappa[v - 1, u], kappa[v, u], kappa[v + 1, u])
@@ -109,8 +111,8 @@ def track_extrema(tracks: Tracks, predicted: Array, kappa: Array, config: Extrem
     """
     n = len(tracks)
     pixels, values, found = np.empty((n, 2)), np.empty(n, np.float32), np.empty(n, np.bool_)
-    weight, sigma = config.prediction_weight, config.prediction_sigma_px
-    _climb_all(kappa, np.ascontiguousarray(predicted), weight, sigma, config.max_steps, config.gate_px, pixels, values, found)
+    weight, sigma, climbable = config.prediction_weight, config.prediction_sigma_px, np.ascontiguousarray(predicted)
+    _climb_all(kappa, climbable, weight, sigma, config.max_steps, config.gate_px, config.min_roundness, pixels, values, found)
     missed = np.where(found, np.int32(0), tracks.missed + np.int32(1))
     moved = Tracks(tracks.ids, pixels, np.where(found, values, tracks.kappa), tracks.ages + np.int32(1), missed)
     u, v, (height, width) = pixels[:, 0], pixels[:, 1], kappa.shape
