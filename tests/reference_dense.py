@@ -93,6 +93,21 @@ def depth_and_normals(layers, camera):
     return depth, normals
 
 
+def zero_crossings(distance, is_known, color):
+    """Rows [x, y, z, r, g, b] where the sign changes along an edge of some cube of known voxels; fields indexed [x, y, z]."""
+    found = {}
+    for corner in itertools.product(*(range(n - 1) for n in distance.shape)):
+        cube = [tuple(np.add(corner, step)) for step in itertools.product(range(2), repeat=3)]
+        if not all(is_known[voxel] for voxel in cube):
+            continue
+        for a, b in itertools.combinations(cube, 2):
+            if np.abs(np.subtract(a, b)).sum() == 1 and (distance[a] < 0) != (distance[b] < 0):
+                share = distance[a] / (distance[a] - distance[b])
+                place = (1 - share) * np.array(a) + share * np.array(b)
+                found[a, b] = [*place, *((1 - share) * color[a] + share * color[b])]
+    return np.array([found[key] for key in sorted(found)])
+
+
 def component_sizes(triangles):
     """Flood fill over triangles that share a vertex."""
     left, sizes = set(range(len(triangles))), np.zeros(len(triangles), int)

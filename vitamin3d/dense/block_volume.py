@@ -4,15 +4,12 @@
 import numpy as np
 
 from vitamin3d._jit import inlined, kernel
+from vitamin3d.dense.marching_cubes import EMPTY, SIDE, VOXELS, Blocks, zero_level
 from vitamin3d.geometry.camera import Camera
 from vitamin3d.geometry.se3 import inverse
 from vitamin3d.types import Array, DepthView
 
-SIDE = 8
-"""Voxels along the side of a block."""
-VOXELS = SIDE**3
 KEY_BITS, KEY_OFFSET = 21, 1 << 20
-EMPTY = -1
 FIRST_BLOCKS = 1 << 13
 """Capacity at the start; doubles when it is used up."""
 ROUNDING = 1e-4
@@ -42,6 +39,15 @@ def _rehash(old, new):  # type: ignore[no-untyped-def]
         if old[i, 0] != EMPTY:
             at = _slot(new, old[i, 0])
             new[at, 0], new[at, 1] = old[i, 0], old[i, 1]
+
+
+@kernel
+def _find_near(table, keys, near):  # type: ignore[no-untyped-def]
+    """Rows (N, 8) of the blocks at a block's key and one further along x, y, z (bits of the column), -1 where there is none."""
+    for b in range(keys.shape[0]):
+        for k in range(8):
+            at = _slot(table, _key(keys[b, 0] + (k & 1), keys[b, 1] + (k >> 1 & 1), keys[b, 2] + (k >> 2)))
+            near[b, k] = table[at, 1]
 
 
 @kernel
@@ -195,40 +201,10 @@ class BlockVolume:
         )
 
     def extract(self) -> tuple[Array, Array, Array]:
-        """Vertices (V, 3), triangles (F, 3) and colours (V, 3) in 0–1 of the zero level, in an order that depends on the values alone.
-
-        Open3D's marching cubes, on its VoxelBlockGrid filled with these voxels.
-        """
-        import open3d as o3d
-
+        """Vertices (V, 3), triangles (F, 3) and colours (V, 3) in 0–1 of the zero level, in an order that depends on the values alone."""
         n = self.num_blocks
-        known = (self._weight[:n] >= self.min_weight).astype(np.float32)
-        if not known.any():
-            return np.zeros((0, 3)), np.zeros((0, 3), np.int32), np.zeros((0, 3))
-        grid = o3d.t.geometry.VoxelBlockGrid(
-            attr_names=("tsdf", "weight", "color"),
-            attr_dtypes=(o3d.core.float32, o3d.core.float32, o3d.core.float32),
-            attr_channels=((1), (1), (3)),
-            voxel_size=self.voxel_length,
-            block_resolution=SIDE,
-            block_count=n,
-            device=o3d.core.Device("CPU:0"),
-        )
-        rows = grid.hashmap().activate(o3d.core.Tensor(self._keys[:n].astype(np.int32)))[0].numpy().astype(np.int64)
-        for name, values in (("tsdf", self._distance[:n]), ("weight", known), ("color", self._shade[:n])):
-            grid.attribute(name).numpy()[rows] = values.reshape(n, SIDE, SIDE, SIDE, -1)
-        mesh = grid.extract_triangle_mesh(weight_threshold=0.5)
-        if "positions" not in mesh.vertex or not len(mesh.vertex.positions):
-            return np.zeros((0, 3)), np.zeros((0, 3), np.int32), np.zeros((0, 3))
-        return _in_order(mesh.vertex.positions.numpy(), mesh.triangle.indices.numpy(), mesh.vertex.colors.numpy())
-
-
-def _in_order(vertices: Array, triangles: Array, colors: Array) -> tuple[Array, Array, Array]:
-    """The same mesh, vertices sorted by position and triangles by vertices: threads and hash tables leave no trace."""
-    order = np.lexsort(vertices.T)
-    rank = np.empty(len(order), np.int32)
-    rank[order] = np.arange(len(order), dtype=np.int32)
-    faces = rank[triangles]
-    first = faces.argmin(axis=1)
-    faces = np.take_along_axis(faces, (first[:, None] + np.arange(3)) % 3, axis=1)
-    return vertices[order], faces[np.lexsort(faces.T[::-1])], colors[order]
+        near = np.empty((n, 8), np.int64)
+        _find_near(self._table, self._keys[:n], near)
+        blocks = Blocks(self._keys[:n], near, self._distance[:n], self._weight[:n], self._shade[:n])
+        vertices, triangles, colors = zero_level(blocks, self.min_weight, self.voxel_length)
+        return vertices, triangles, colors / np.float32(255.0)
