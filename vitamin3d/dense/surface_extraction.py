@@ -2,54 +2,107 @@
 """The mesh that leaves the volume: without crumbs, with normals."""
 
 import numpy as np
-from scipy.sparse import coo_matrix
-from scipy.sparse.csgraph import connected_components
 
+from vitamin3d._jit import inlined, kernel
 from vitamin3d.config import SurfaceConfig
 from vitamin3d.types import Array, Surface
 
 
 def clean(surface: Surface, config: SurfaceConfig) -> Surface:
     """The surface without small connected pieces and unreferenced vertices, with vertex normals on the triangles' front side."""
-    triangles = surface.triangles[_has_area(surface)]
+    triangles = surface.triangles[_has_area(surface.vertices_world, surface.triangles)]
     kept = triangles[component_sizes(triangles, len(surface.vertices_world)) >= config.min_component_triangles]
-    used, renumbered = np.unique(kept, return_inverse=True)
-    faces = renumbered.reshape(-1, 3).astype(np.int32)
-    vertices = surface.vertices_world[used]
+    number = np.full(len(surface.vertices_world), -1, np.int32)
+    _mark(kept, number)
+    used = np.flatnonzero(number == 0)
+    number[used] = np.arange(len(used), dtype=np.int32)
+    vertices, faces = surface.vertices_world[used], number[kept]
     return Surface(vertices, faces, vertex_normals(vertices, faces), surface.colors[used])
 
 
 def component_sizes(triangles: Array, num_vertices: int) -> Array:
     """(F,) number of triangles in the connected piece (through shared vertices) of each triangle."""
-    if len(triangles) == 0:
-        return np.zeros(0, np.int64)
-    rows, columns = np.concatenate([triangles[:, 0], triangles[:, 1]]), np.concatenate([triangles[:, 1], triangles[:, 2]])
-    graph = coo_matrix((np.ones(len(rows), np.int8), (rows, columns)), shape=(num_vertices, num_vertices))
-    labels = connected_components(graph, directed=False)[1][triangles[:, 0]]
-    return np.asarray(np.bincount(labels)[labels])
+    sizes = np.empty(len(triangles), np.int64)
+    _count_connected(_as_int32(triangles), np.arange(num_vertices, dtype=np.int32), np.zeros(num_vertices, np.int64), sizes)
+    return sizes
 
 
 def vertex_normals(vertices: Array, triangles: Array) -> Array:
     """Unit normals (V, 3): the sum of the normals of the vertex's triangles, weighted by area; zero without triangles."""
-    summed = _corner_sums(_scaled_normals(vertices, triangles), triangles, len(vertices))
-    length = np.linalg.norm(summed, axis=1, keepdims=True)
-    return np.asarray(np.divide(summed, length, out=np.zeros_like(summed), where=length > 0))
+    normals = np.zeros((len(vertices), 3))
+    _add_normals(np.ascontiguousarray(vertices, np.float64), _as_int32(triangles), normals)
+    return normals
 
 
-def _scaled_normals(vertices: Array, triangles: Array) -> Array:
-    """(F, 3) normals with the length of twice the area, on the side from which the corners run counter-clockwise."""
-    a, b, c = (vertices[triangles[:, k]] for k in range(3))
-    return np.asarray(np.cross(b - a, c - a))
-
-
-def _corner_sums(values: Array, triangles: Array, count: int) -> Array:
-    """(count, 3) sums of the triangles' values (F, 3) over the triangles around each vertex."""
-    corners = triangles.ravel()
-    return np.stack([np.bincount(corners, np.repeat(values[:, k], 3), count) for k in range(3)], axis=1).astype(np.float64)
-
-
-def _has_area(surface: Surface) -> Array:
+def _has_area(vertices: Array, triangles: Array) -> Array:
     """(F,) bool: not collapsed to a line or a point."""
-    a, b, c = (surface.triangles[:, k] for k in range(3))
-    is_proper = (a != b) & (b != c) & (c != a)
-    return np.asarray(is_proper & (_scaled_normals(surface.vertices_world, surface.triangles) != 0).any(axis=1))
+    has_area = np.empty(len(triangles), np.bool_)
+    _check_area(np.ascontiguousarray(vertices, np.float64), _as_int32(triangles), has_area)
+    return has_area
+
+
+def _as_int32(triangles: Array) -> Array:
+    return np.ascontiguousarray(triangles, np.int32)
+
+
+@kernel
+def _mark(triangles, number):  # type: ignore[no-untyped-def]
+    """Sets the corners' numbers (V,) to 0."""
+    for f in range(triangles.shape[0]):
+        for k in range(3):
+            number[triangles[f, k]] = 0
+
+
+@inlined
+def _root(parents, v):  # type: ignore[no-untyped-def]
+    """The first of a piece; the way there becomes shorter."""
+    while parents[v] != v:
+        parents[v] = parents[parents[v]]
+        v = parents[v]
+    return v
+
+
+@kernel
+def _count_connected(triangles, parents, counts, sizes):  # type: ignore[no-untyped-def]
+    """`parents` (V,) come as each its own, `counts` (V,) as 0."""
+    for f in range(triangles.shape[0]):
+        for k in range(2):
+            a, b = _root(parents, triangles[f, k]), _root(parents, triangles[f, k + 1])
+            parents[max(a, b)] = min(a, b)
+    for f in range(triangles.shape[0]):
+        counts[_root(parents, triangles[f, 0])] += 1
+    for f in range(triangles.shape[0]):
+        sizes[f] = counts[_root(parents, triangles[f, 0])]
+
+
+@inlined
+def _scaled_normal(vertices, a, b, c):  # type: ignore[no-untyped-def]
+    """A normal as long as twice the area, on the side from which the corners run counter-clockwise."""
+    px, py, pz = vertices[b, 0] - vertices[a, 0], vertices[b, 1] - vertices[a, 1], vertices[b, 2] - vertices[a, 2]
+    qx, qy, qz = vertices[c, 0] - vertices[a, 0], vertices[c, 1] - vertices[a, 1], vertices[c, 2] - vertices[a, 2]
+    return py * qz - pz * qy, pz * qx - px * qz, px * qy - py * qx
+
+
+@kernel
+def _check_area(vertices, triangles, has_area):  # type: ignore[no-untyped-def]
+    for f in range(triangles.shape[0]):
+        a, b, c = triangles[f, 0], triangles[f, 1], triangles[f, 2]
+        x, y, z = _scaled_normal(vertices, a, b, c)
+        has_area[f] = a != b and b != c and c != a and (x != 0.0 or y != 0.0 or z != 0.0)
+
+
+@kernel
+def _add_normals(vertices, triangles, normals):  # type: ignore[no-untyped-def]
+    """`normals` (V, 3) come as 0."""
+    for f in range(triangles.shape[0]):
+        x, y, z = _scaled_normal(vertices, triangles[f, 0], triangles[f, 1], triangles[f, 2])
+        for k in range(3):
+            v = triangles[f, k]
+            normals[v, 0] += x
+            normals[v, 1] += y
+            normals[v, 2] += z
+    for v in range(normals.shape[0]):
+        length = np.sqrt(normals[v, 0] ** 2 + normals[v, 1] ** 2 + normals[v, 2] ** 2)
+        if length > 0.0:
+            for k in range(3):
+                normals[v, k] /= length
