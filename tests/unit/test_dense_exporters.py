@@ -132,6 +132,16 @@ def test_colours_of_normals():
     np.testing.assert_allclose(rgb_from_normals(normals, to_world)[0, 0], [0, 128, 128], atol=1)
 
 
+def test_maps_equal_the_formulas():
+    rng = np.random.default_rng(0)
+    normals, turn = rng.normal(size=(20, 30, 3)).astype(np.float32), exp_se3(np.array([0, 0, 0, 0.3, -0.8, 0.2]))[:3, :3]
+    expected = np.rint(127.5 * (np.clip(normals @ turn.T, -1, 1) + 1))
+    assert np.abs(rgb_from_normals(normals, turn) - expected).max() == 0
+    depth = rng.uniform(-1, 80, (20, 30)).astype(np.float32)
+    counts = np.rint(depth.astype(float) * 1234.5)
+    np.testing.assert_array_equal(counts_from_depth(depth, 1234.5), np.where((counts >= 0) & (counts < 65536), counts, 0))
+
+
 def test_normal_maps_are_rgb_files(tmp_path):
     import cv2
 

@@ -6,6 +6,7 @@ from pathlib import Path
 import cv2
 import numpy as np
 
+from vitamin3d._jit import kernel
 from vitamin3d.errors import InputError, OutputError
 from vitamin3d.exporters.files import write_file
 from vitamin3d.types import Array
@@ -39,8 +40,16 @@ def read_depth_map(path: Path, counts_per_unit: float) -> Array:
 
 def counts_from_depth(depth: Array, counts_per_unit: float) -> Array:
     """(H, W) uint16, rounded; what does not fit, NaN and below zero become 0."""
-    counts = np.rint(np.nan_to_num(np.asarray(depth, np.float64), nan=0.0, posinf=0.0, neginf=0.0) * counts_per_unit)
-    return np.where((counts >= 0) & (counts <= MAX_COUNT), counts, 0).astype(np.uint16)
+    depth, counts = np.ascontiguousarray(depth, np.float64), np.empty(np.shape(depth), np.uint16)
+    _count(depth.ravel(), counts_per_unit, counts.ravel())
+    return counts
+
+
+@kernel
+def _count(depth, counts_per_unit, counts):  # type: ignore[no-untyped-def]
+    for n in range(depth.shape[0]):
+        rounded = np.rint(depth[n] * counts_per_unit)
+        counts[n] = np.uint16(rounded) if 0.0 <= rounded <= MAX_COUNT else np.uint16(0)
 
 
 def write_png(image: Array, path: Path) -> None:

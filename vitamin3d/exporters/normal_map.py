@@ -5,6 +5,7 @@ from pathlib import Path
 
 import numpy as np
 
+from vitamin3d._jit import kernel
 from vitamin3d.exporters.depth_map import write_png
 from vitamin3d.geometry.camera import Camera
 from vitamin3d.types import Array, Surface
@@ -29,10 +30,21 @@ def write_normal_map(normals: Array, path: Path, R_frame_cam: Array | None = Non
 
 def rgb_from_normals(normals: Array, R_frame_cam: Array | None = None) -> Array:
     """(H, W, 3) uint8 RGB `(n + 1) / 2` of normals (H, W, 3), 0 where there is none; see `write_normal_map`."""
-    turned = normals * RED_GREEN_BLUE if R_frame_cam is None else normals @ R_frame_cam.T
-    rgb = np.rint(127.5 * (np.clip(turned, -1.0, 1.0) + 1.0)).astype(np.uint8)
-    rgb[~(normals != 0).any(axis=-1)] = 0
-    return np.asarray(rgb)
+    to_rgb = np.diag(RED_GREEN_BLUE) if R_frame_cam is None else R_frame_cam
+    normals, rgb = np.ascontiguousarray(normals, np.float32), np.empty(normals.shape, np.uint8)
+    _paint(normals.reshape(-1, 3), np.ascontiguousarray(to_rgb, np.float64), rgb.reshape(-1, 3))
+    return rgb
+
+
+@kernel
+def _paint(normals, to_rgb, rgb):  # type: ignore[no-untyped-def]
+    for n in range(normals.shape[0]):
+        x, y, z = normals[n, 0], normals[n, 1], normals[n, 2]
+        for c in range(3):
+            turned = to_rgb[c, 0] * x + to_rgb[c, 1] * y + to_rgb[c, 2] * z
+            rgb[n, c] = np.uint8(np.rint(127.5 * (min(max(turned, -1.0), 1.0) + 1.0)))
+        if x == 0.0 and y == 0.0 and z == 0.0:
+            rgb[n, 0], rgb[n, 1], rgb[n, 2] = 0, 0, 0
 
 
 def cast_normal_map(surface: Surface, camera: Camera, T_cam_world: Array) -> Array:
