@@ -204,7 +204,7 @@ class Reconstruction:
         max_depth = self.config.fusion.max_depth * float(np.nanmedian(self.median_depths))
         if self.store is not None:
             with self.times.timed("keeping_views"):
-                kept = packed(dataclasses.replace(view, depth=np.where(view.depth < max_depth, view.depth, np.float32(0.0))))
+                kept = packed(view, max_depth)
                 self.store.add(kept)
                 view, max_depth = kept.view(), np.inf  # exactly what will be taken out again
         with self.times.timed("fusion_low"):

@@ -7,70 +7,113 @@ from collections.abc import Callable, Iterator
 from dataclasses import dataclass, replace
 from typing import IO
 
+import cv2
 import numpy as np
 
+from vitamin3d._jit import kernel
 from vitamin3d.types import Array, DepthView
 
 CODES = 65534
-"""Steps of the logarithm between the least and the greatest value of a view."""
+"""Steps between the least and the greatest value of a view."""
+
+
+@dataclass(frozen=True)
+class Steps:
+    """How 16 bits count the positive numbers of a view, whose bits, read as integers, go about as their logarithms."""
+
+    lowest: int
+    """The bits of the least number, code 1; the greatest has at most CODES."""
+    shift: int
+    """A step is 2 ** shift of them."""
 
 
 @dataclass(frozen=True)
 class Packed:
-    """A view in 5 bytes a pixel (grey) or 7: depth and weight as steps of their logarithms, 0 where there is none."""
+    """A view in 5 bytes a pixel (grey) or 7: depth and weight in steps of their size, 0 where there is none."""
 
     timestamp_ns: int
     T_cam_world: Array
     """(4, 4)."""
     shape: tuple[int, int]
-    depth_range: tuple[float, float]
-    weight_range: tuple[float, float]
+    depth_steps: Steps
+    weight_steps: Steps
+    middle_depth: float
+    """Geometric mean of the least and the greatest depth."""
     num_channels: int
     """1 where the picture is grey."""
     data: bytes
-
-    @property
-    def middle_depth(self) -> float:
-        """Of the depths, as the logarithm goes."""
-        return float(np.exp(0.5 * sum(self.depth_range)))
 
     def view(self) -> DepthView:
         """The view, without normals; the same each time, bit by bit."""
         size = self.shape[0] * self.shape[1]
         codes = np.frombuffer(self.data, np.uint16, 2 * size).reshape(2, *self.shape)
         color = np.frombuffer(self.data, np.uint8, self.num_channels * size, 4 * size).reshape(*self.shape, self.num_channels)
-        depth, weights = (_decoded(c, r) for c, r in zip(codes, (self.depth_range, self.weight_range), strict=True))
-        no_normals = np.zeros((0, 0, 3), np.float32)
-        return DepthView(self.timestamp_ns, self.T_cam_world, depth, no_normals, np.repeat(color, 3 // self.num_channels, axis=2), weights)
+        depth, weights = (_decoded(c, steps) for c, steps in zip(codes, (self.depth_steps, self.weight_steps), strict=True))
+        rgb = np.array(color) if self.num_channels == 3 else np.asarray(cv2.cvtColor(color, cv2.COLOR_GRAY2RGB))
+        return DepthView(self.timestamp_ns, self.T_cam_world, depth, np.zeros((0, 0, 3), np.float32), rgb, weights)
 
 
-def packed(view: DepthView) -> Packed:
-    """The view in few bytes: depth and weights to a part in some thousand."""
-    depth, depth_range = _encoded(view.depth)
-    weights, weight_range = _encoded(np.where(view.depth > 0, view.weights, np.float32(0.0)))
-    is_grey = (view.color[..., 0] == view.color[..., 1]).all() and (view.color[..., 1] == view.color[..., 2]).all()
-    channels = 1 if is_grey else 3
-    data = depth.tobytes() + weights.tobytes() + np.ascontiguousarray(view.color[..., :channels]).tobytes()
-    height, width = view.depth.shape
-    return Packed(view.timestamp_ns, view.T_cam_world, (height, width), depth_range, weight_range, channels, data)
+def packed(view: DepthView, max_depth: float = np.inf) -> Packed:
+    """The view in few bytes, depth and weights to a part in some thousand, without what lies at `max_depth` or beyond."""
+    depth, weights = np.ascontiguousarray(view.depth, np.float32), np.ascontiguousarray(view.weights, np.float32)
+    limit = np.float32(max_depth)
+    depth_codes, depth_steps, middle = _encoded(depth, depth, limit)
+    weight_codes, weight_steps, _ = _encoded(weights, depth, limit)
+    color = np.ascontiguousarray(view.color)
+    channels = 1 if _is_grey(color) else 3
+    data = depth_codes.tobytes() + weight_codes.tobytes() + np.ascontiguousarray(color[..., :channels]).tobytes()
+    height, width = depth.shape
+    return Packed(view.timestamp_ns, view.T_cam_world, (height, width), depth_steps, weight_steps, middle, channels, data)
 
 
-def _encoded(values: Array) -> tuple[Array, tuple[float, float]]:
-    """(H, W) uint16 and the logarithms of the least and the greatest positive value."""
-    there = values > 0
-    if not there.any():
-        return np.zeros(values.shape, np.uint16), (0.0, 0.0)
-    logarithms = np.log(values, out=np.zeros(values.shape, np.float32), where=there)
-    low, high = float(logarithms[there].min()), float(logarithms[there].max())
-    steps = np.rint((logarithms - low) * np.float32(CODES / max(high - low, 1e-6)))
-    return np.where(there, np.clip(steps, 0, CODES) + 1, 0).astype(np.uint16), (low, high)
+@kernel
+def _is_grey(color):  # type: ignore[no-untyped-def]
+    for v in range(color.shape[0]):
+        for u in range(color.shape[1]):
+            if color[v, u, 0] != color[v, u, 1] or color[v, u, 1] != color[v, u, 2]:
+                return False
+    return True
 
 
-def _decoded(codes: Array, limits: tuple[float, float]) -> Array:
+@kernel
+def _span(values, bits, depth, limit):  # type: ignore[no-untyped-def]
+    """The least and the greatest bits of the positive values whose depth is positive and below the limit; 0, 0: there are none."""
+    lowest, highest = np.int32(0x7FFFFFFF), np.int32(0)
+    for n in range(values.shape[0]):
+        if values[n] > 0.0 and 0.0 < depth[n] < limit:
+            lowest, highest = min(lowest, bits[n]), max(highest, bits[n])
+    return (lowest, highest) if highest > 0 else (highest, highest)
+
+
+@kernel
+def _encode(values, bits, depth, limit, lowest, shift, codes):  # type: ignore[no-untyped-def]
+    half = (1 << shift) >> 1
+    for n in range(values.shape[0]):
+        is_there = values[n] > 0.0 and 0.0 < depth[n] < limit
+        codes[n] = min(((np.int64(bits[n]) - lowest + half) >> shift) + 1, CODES) if is_there else 0
+
+
+@kernel
+def _decode(codes, lowest, shift, bits):  # type: ignore[no-untyped-def]
+    for n in range(codes.shape[0]):
+        bits[n] = lowest + ((np.int64(codes[n]) - 1) << shift) if codes[n] > 0 else 0
+
+
+def _encoded(values: Array, depth: Array, limit: Array) -> tuple[Array, Steps, float]:
+    """(H, W) uint16, 0 = none, what they mean, and the geometric mean of the least and the greatest value."""
+    flat, where, bits, codes = values.ravel(), depth.ravel(), values.view(np.int32).ravel(), np.empty(values.shape, np.uint16)
+    lowest, highest = _span(flat, bits, where, limit)
+    shift = max(0, int(highest - lowest) // (CODES - 1)).bit_length()
+    _encode(flat, bits, where, limit, lowest, shift, codes.ravel())
+    least, greatest = np.array([lowest, highest], np.int32).view(np.float32).astype(np.float64)
+    return codes, Steps(int(lowest), shift), float(np.sqrt(least * greatest))
+
+
+def _decoded(codes: Array, steps: Steps) -> Array:
     """(H, W) float32."""
-    low, high = limits
-    values = np.exp(np.arange(CODES + 1, dtype=np.float64) * (max(high - low, 1e-6) / CODES) + low)
-    return np.concatenate([[0.0], values]).astype(np.float32)[codes]
+    values = np.empty(codes.shape, np.float32)
+    _decode(codes.ravel(), steps.lowest, steps.shift, values.view(np.int32).ravel())
+    return values
 
 
 @dataclass(frozen=True)
