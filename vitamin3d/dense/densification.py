@@ -8,7 +8,6 @@ the deviation that its parallax leaves.
 
 from dataclasses import dataclass, replace
 
-import cv2
 import numpy as np
 
 from vitamin3d._jit import inlined, kernel
@@ -40,11 +39,23 @@ class CanvasPicture:
 
 def canvas_picture(snapshot: MapSnapshot, image: Array, is_outside: Array) -> CanvasPicture:
     """A keyframe with its picture (H, W) on the canvas; `is_outside` (H, W) bool says where there is none."""
-    image = np.where(is_outside, np.uint8(0), np.maximum(image, np.uint8(1)))
-    height, width = (n // REDUCTION * REDUCTION for n in image.shape)
-    reduced = cv2.resize(image[:height, :width], (width // REDUCTION, height // REDUCTION), interpolation=cv2.INTER_AREA)
-    outside = is_outside[:height, :width].reshape(height // REDUCTION, REDUCTION, width // REDUCTION, REDUCTION).any(axis=(1, 3))
-    return CanvasPicture(snapshot, image, np.where(outside, np.uint8(0), np.maximum(reduced, np.uint8(1))))
+    height, width = (n // REDUCTION for n in image.shape)
+    masked, reduced = np.empty(image.shape, np.uint8), np.empty((height, width), np.uint8)
+    _mask_and_reduce(np.ascontiguousarray(image), is_outside, masked, reduced)
+    return CanvasPicture(snapshot, masked, reduced)
+
+
+@kernel
+def _mask_and_reduce(image, is_outside, masked, reduced):  # type: ignore[no-untyped-def]
+    """The picture, 0 outside and at least 1 inside, and the means of four pixels, 0 where one of them is outside."""
+    for v in range(image.shape[0]):
+        for u in range(image.shape[1]):
+            masked[v, u] = 0 if is_outside[v, u] else max(image[v, u], 1)
+    for v in range(reduced.shape[0]):
+        for u in range(reduced.shape[1]):
+            a, b = np.int32(masked[2 * v, 2 * u]), np.int32(masked[2 * v, 2 * u + 1])
+            c, d = np.int32(masked[2 * v + 1, 2 * u]), np.int32(masked[2 * v + 1, 2 * u + 1])
+            reduced[v, u] = (a + b + c + d + 2) >> 2 if a > 0 and b > 0 and c > 0 and d > 0 else 0
 
 
 @inlined

@@ -160,7 +160,7 @@ class Camera:
         returned = np.abs(self.undistort(source) - ideal).max(axis=1) < 0.5
         source[~returned] = -10.0
         source = source.reshape(canvas.height, canvas.width, 2).astype(np.float32)
-        return source[..., 0], source[..., 1]
+        return np.ascontiguousarray(source[..., 0]), np.ascontiguousarray(source[..., 1])
 
     def draw_on_canvas(self, image: Array, maps: tuple[Array, Array]) -> Array:
         """The picture undistorted onto the canvas of `canvas_maps`; black outside."""
