@@ -50,33 +50,39 @@ def _find_near(table, keys, near):  # type: ignore[no-untyped-def]
             near[b, k] = table[at, 1]
 
 
+@inlined
+def _place(T, k, x, y, d, block):  # type: ignore[no-untyped-def]
+    """Block along one axis of the world in which the point at depth d of the ray (x, y, 1) lies."""
+    return int(np.floor(((T[k, 0] * x + T[k, 1] * y + T[k, 2]) * d + T[k, 3]) / block))
+
+
 @kernel
 def _touch(depth, intrinsics, T_world_cam, block, reach, max_depth, stride, table, keys, count, stamps, stamp, touched):  # type: ignore[no-untyped-def]
     """Allocates the blocks within `reach` of the surface along the rays; (blocks now, blocks of this view), or -1: table full."""
     fx, fy, cx, cy = intrinsics
-    found = 0
+    found, steps = 0, int(np.ceil(2.0 * reach / (0.5 * block)))
+    before = np.full(steps + 1, EMPTY, np.int64)  # of the last ray: mostly the same blocks
     for v in range(0, depth.shape[0], stride):
+        y = (v - cy) / fy
         for u in range(0, depth.shape[1], stride):
             z = depth[v, u]
             if not 0.0 < z < max_depth:
                 continue
-            x, y = (u - cx) / fx, (v - cy) / fy
+            x = (u - cx) / fx
             length = np.sqrt(x * x + y * y + 1.0)
-            steps = int(np.ceil(2.0 * reach / (0.5 * block)))
             for k in range(steps + 1):
                 d = z + (2.0 * k / steps - 1.0) * reach / length
                 if d <= 0.0:
                     continue
-                bx = int(
-                    np.floor((T_world_cam[0, 0] * x * d + T_world_cam[0, 1] * y * d + T_world_cam[0, 2] * d + T_world_cam[0, 3]) / block)
-                )
-                by = int(
-                    np.floor((T_world_cam[1, 0] * x * d + T_world_cam[1, 1] * y * d + T_world_cam[1, 2] * d + T_world_cam[1, 3]) / block)
-                )
-                bz = int(
-                    np.floor((T_world_cam[2, 0] * x * d + T_world_cam[2, 1] * y * d + T_world_cam[2, 2] * d + T_world_cam[2, 3]) / block)
+                bx, by, bz = (
+                    _place(T_world_cam, 0, x, y, d, block),
+                    _place(T_world_cam, 1, x, y, d, block),
+                    _place(T_world_cam, 2, x, y, d, block),
                 )
                 key = _key(bx, by, bz)
+                if key == before[k]:
+                    continue
+                before[k] = key
                 at = _slot(table, key)
                 if table[at, 0] == EMPTY:
                     if count >= keys.shape[0]:
@@ -92,50 +98,68 @@ def _touch(depth, intrinsics, T_world_cam, block, reach, max_depth, stride, tabl
     return count, found
 
 
+@inlined
+def _project(key, camera, R, t, voxel, truncation, width, height, pixel, far, scale):  # type: ignore[no-untyped-def]
+    """Of each voxel of a block the pixel that it falls on (-1: none), its depth, and truncations per depth along the ray.
+
+    Without a branch, so that LLVM does several voxels at a time.
+    """
+    fx, fy, cx, cy = camera
+    x_0, y_0, z_0 = key[0] * SIDE * voxel, key[1] * SIDE * voxel, key[2] * SIDE * voxel
+    for row in range(SIDE * SIDE):
+        wy, wz = y_0 + (row % SIDE) * voxel, z_0 + (row // SIDE) * voxel
+        a = np.float32(R[0, 0] * x_0 + R[0, 1] * wy + R[0, 2] * wz + t[0])
+        b = np.float32(R[1, 0] * x_0 + R[1, 1] * wy + R[1, 2] * wz + t[1])
+        c = np.float32(R[2, 0] * x_0 + R[2, 1] * wy + R[2, 2] * wz + t[2])
+        da, db, dc = np.float32(R[0, 0] * voxel), np.float32(R[1, 0] * voxel), np.float32(R[2, 0] * voxel)
+        for k in range(SIDE):
+            z = c + np.float32(k) * dc
+            x, y = (a + np.float32(k) * da) / z, (b + np.float32(k) * db) / z
+            u, v = np.floor(fx * x + cx), np.floor(fy * y + cy)
+            is_seen = (z > np.float32(0.0)) & (u >= np.float32(0.0)) & (v >= np.float32(0.0)) & (u < width) & (v < height)
+            i = row * SIDE + k
+            pixel[i] = np.int32(v) * np.int32(width) + np.int32(u) if is_seen else np.int32(-1)
+            far[i] = z
+            scale[i] = np.sqrt(x * x + y * y + np.float32(1.0)) / truncation
+
+
 @kernel
-def _integrate(depth, pixel_weights, color, intrinsics, R, t, voxel, truncation, max_depth, touched, keys, distance, weight, shade, sign):  # type: ignore[no-untyped-def]
+def _integrate(depth, pixel_weights, color, camera, R, t, voxel, truncation, max_depth, touched, keys, distance, weight, shade, sign):  # type: ignore[no-untyped-def]
     """Averages the signed distance along the ray, in truncations, and the colour into the voxels of the blocks `touched`.
 
-    With `sign` -1 the view is taken out again; a voxel of which nothing is left but rounding becomes empty.
+    With `sign` -1 the view is taken out again; a voxel of which nothing is left but rounding becomes empty. `camera` float32:
+    focal lengths, and the centre moved by half a pixel.
     """
-    fx, fy, cx, cy = intrinsics
-    height, width = depth.shape
-    for n in range(touched.shape[0]):
-        b = touched[n]
+    width, height = np.float32(depth.shape[1]), np.float32(depth.shape[0])
+    pixel, far, scale = np.empty(VOXELS, np.int32), np.empty(VOXELS, np.float32), np.empty(VOXELS, np.float32)
+    depths, weights, colors = depth.reshape(-1), pixel_weights.reshape(-1), color.reshape(-1, 3)
+    for b in touched:
+        _project(keys[b], camera, R, t, voxel, np.float32(truncation), width, height, pixel, far, scale)
         for i in range(VOXELS):
-            wx = (keys[b, 0] * SIDE + i % SIDE) * voxel
-            wy = (keys[b, 1] * SIDE + (i // SIDE) % SIDE) * voxel
-            wz = (keys[b, 2] * SIDE + i // (SIDE * SIDE)) * voxel
-            z = R[2, 0] * wx + R[2, 1] * wy + R[2, 2] * wz + t[2]
-            if z <= 0.0:
+            p = pixel[i]
+            if p < 0:
                 continue
-            x = (R[0, 0] * wx + R[0, 1] * wy + R[0, 2] * wz + t[0]) / z
-            y = (R[1, 0] * wx + R[1, 1] * wy + R[1, 2] * wz + t[1]) / z
-            u, v = int(np.floor(fx * x + cx + 0.5)), int(np.floor(fy * y + cy + 0.5))
-            if u < 0 or v < 0 or u >= width or v >= height:
-                continue
-            d = depth[v, u]
+            d = depths[p]
             if not 0.0 < d < max_depth:
                 continue
-            signed = (d - z) * np.sqrt(x * x + y * y + 1.0) / truncation
-            if signed < -1.0:
+            signed = (d - far[i]) * scale[i]
+            if signed < np.float32(-1.0):
                 continue
-            w = pixel_weights[v, u]
-            if signed < 0.0:
-                w *= 1.0 + signed  # what is behind the surface was not seen
+            w = weights[p]
+            if signed < np.float32(0.0):
+                w *= np.float32(1.0) + signed  # what is behind the surface was not seen
             if not w > 0.0:
                 continue
-            before = weight[b, i]
-            after = before + sign * w
+            after = weight[b, i] + sign * w
             if after < ROUNDING * w:
                 distance[b, i], weight[b, i] = 0.0, 0.0
                 shade[b, i, 0], shade[b, i, 1], shade[b, i, 2] = 0.0, 0.0, 0.0
                 continue
             share = sign * w / after
-            distance[b, i] += share * (min(signed, 1.0) - distance[b, i])
+            distance[b, i] += share * (min(signed, np.float32(1.0)) - distance[b, i])
             weight[b, i] = after
             for c in range(3):
-                shade[b, i, c] += share * (color[v, u, c] - shade[b, i, c])
+                shade[b, i, c] += share * (np.float32(colors[p, c]) - shade[b, i, c])
 
 
 class BlockVolume:
@@ -170,10 +194,11 @@ class BlockVolume:
 
     def _add(self, view: DepthView, canvas: Camera, max_depth: float, sign: float) -> None:
         touched = self._touched(view, canvas, max_depth)
+        camera = np.array([canvas.fx, canvas.fy, canvas.cx + 0.5, canvas.cy + 0.5], np.float32)
         R, t = np.ascontiguousarray(view.T_cam_world[:3, :3]), np.ascontiguousarray(view.T_cam_world[:3, 3])
         _integrate(
-            view.depth, view.weights, view.color, canvas.intrinsics, R, t, self.voxel_length, self.truncation, max_depth,
-            touched, self._keys, self._distance, self._weight, self._shade, sign,
+            view.depth, view.weights, view.color, camera, R, t, self.voxel_length, self.truncation, np.float32(max_depth),
+            touched, self._keys, self._distance, self._weight, self._shade, np.float32(sign),
         )  # fmt: skip
 
     def _touched(self, view: DepthView, canvas: Camera, max_depth: float) -> Array:
@@ -197,7 +222,7 @@ class BlockVolume:
         _rehash(self._table, table)
         self._table = table
         self._keys, self._stamps, self._distance, self._weight, self._shade = (
-            np.concatenate([array, np.zeros_like(array)]) for array in (self._keys, self._stamps, self._distance, self._weight, self._shade)
+            _doubled(array) for array in (self._keys, self._stamps, self._distance, self._weight, self._shade)
         )
 
     def extract(self) -> tuple[Array, Array, Array]:
@@ -208,3 +233,10 @@ class BlockVolume:
         blocks = Blocks(self._keys[:n], near, self._distance[:n], self._weight[:n], self._shade[:n])
         vertices, triangles, colors = zero_level(blocks, self.min_weight, self.voxel_length)
         return vertices, triangles, colors / np.float32(255.0)
+
+
+def _doubled(array: Array) -> Array:
+    """Twice as long, zeros behind; these take memory only when they are written."""
+    longer = np.zeros((2 * len(array), *array.shape[1:]), array.dtype)
+    longer[: len(array)] = array
+    return longer
