@@ -139,14 +139,14 @@ def _rasterize(pixels, triangles, layers, first, second, third, fourth):  # type
             end = au + min(hs * s_out + s_to, min(ht * t_out + t_to, hr * r_out + r_to))
             for u in range(max(left, int(np.ceil(begin))), min(right, int(np.floor(end))) + 1):
                 x = u - au
-                nearness = p + x * p_u + y * p_v
+                nearness = np.float32(p + x * p_u + y * p_v)
                 if nearness > first[v, u]:
                     first[v, u], second[v, u] = nearness, q + x * q_u + y * q_v
                     third[v, u], fourth[v, u] = r + x * r_u + y * r_v, w + x * w_u + y * w_v
 
 
 def rasterize(pixels: Array, triangles: Array, layers: Array, width: int, height: int) -> Array:
-    """Image (height, width, L) float64 of vertex values `layers` (V, L), L <= 4, linear inside each triangle; 0 where there is none.
+    """Image (height, width, L) float32 of vertex values `layers` (V, L), L <= 4, linear inside each triangle; 0 where there is none.
 
     Args:
         pixels: (V, 2) positions in this image.
@@ -156,7 +156,7 @@ def rasterize(pixels: Array, triangles: Array, layers: Array, width: int, height
     In memory one layer comes after the other.
     """
     count = layers.shape[1]
-    values, out = np.zeros((len(layers), 4)), np.zeros((4, height, width))
+    values, out = np.zeros((len(layers), 4)), np.zeros((4, height, width), np.float32)
     values[:, :count] = layers
     _rasterize(np.ascontiguousarray(pixels, np.float64), triangles, values, *out)
     return np.moveaxis(out[:count], 0, 2)
@@ -181,9 +181,9 @@ def depth_and_normals(layers: Array, canvas: Camera) -> tuple[Array, Array]:
     """Depth (H, W) float32 and unit normals (H, W, 3) float32 in the camera frame, towards the camera; 0 where there is none.
 
     Args:
-        layers: (H, W, 3) inverse depth and its gradient per pixel, `[xi, d xi / du, d xi / dv]`; xi = 0 where there is nothing.
+        layers: (H, W, 3) float32 inverse depth and its gradient per pixel, `[xi, d xi / du, d xi / dv]`; xi = 0 where there is nothing.
     """
     depth, normals = np.empty(layers.shape[:2], np.float32), np.empty((*layers.shape[:2], 3), np.float32)
-    xi, slope_u, slope_v = (np.ascontiguousarray(layers[..., k]) for k in range(3))
+    xi, slope_u, slope_v = (np.ascontiguousarray(layers[..., k], np.float32) for k in range(3))
     _shade(xi, slope_u, slope_v, canvas.intrinsics, depth, normals)
     return depth, normals
