@@ -330,6 +330,8 @@ class DensificationConfig:
     """Every so many-th keyframe is densified and fused; the others serve as its neighbours."""
     reach: int = 13
     """Keyframes before and after among which neighbours are looked for."""
+    max_wait_s: float = 0.0
+    """A keyframe waits no longer for later neighbours when the camera is so many seconds further; 0: however long it takes."""
     near_parallax_deg: float = 3.0
     """Two neighbours on each side, with about these parallaxes."""
     far_parallax_deg: float = 6.0
@@ -422,6 +424,8 @@ class ConsistencyConfig:
     """and the ones so many further,"""
     per_side: int = 3
     """together so many on each side."""
+    max_wait_s: float = 0.0
+    """A view waits no longer for later voters when the camera is so many seconds further; 0: however long it takes."""
     tolerance: float = 0.02
     """Relative difference of depth up to which a view confirms."""
     contradicted_weight: float = 0.1
@@ -575,9 +579,9 @@ def live_config(base: Config) -> Config:
         final_adjustment=change(base.final_adjustment, enabled=False),
         calibration=change(base.calibration, refine="off"),
         memory=change(base.memory, max_keyframes=600, max_new_tracks=60_000),
-        densification=change(base.densification, reach=3, planes=32),
+        densification=change(base.densification, reach=3, planes=32, max_wait_s=1.0),
         nltgv=change(base.nltgv, iterations=min(60, base.nltgv.iterations)),
-        consistency=change(base.consistency, first=1, per_side=1),
+        consistency=change(base.consistency, first=1, per_side=1, max_wait_s=1.4),
         fusion=change(base.fusion, keyframes_for_depth=10, backend="blocks"),
     )
 

@@ -22,7 +22,7 @@ from vitamin3d.runtime import DENSE_NICENESS, READ_AHEAD, Observer, RunRecord, r
 from vitamin3d.scale import Scale, scale_from_ground_truth
 from vitamin3d.slam import Slam
 from vitamin3d.tracking.front_end import FrontEnd
-from vitamin3d.types import DepthView, MapSnapshot, Trajectory
+from vitamin3d.types import DepthView, MapSnapshot, NewestFrame, Trajectory
 from vitamin3d.warmup import warm_up
 from vitamin3d.workers import Clock, Closable, Items, ReadAhead, step
 
@@ -240,7 +240,7 @@ class _Dense:
         for view in self._begun().add_keyframe(snapshot):
             self.output.write_view(view, self.scale)
 
-    def add_all(self, snapshots: Iterable[MapSnapshot], done: Callable[[DepthView], None] | None = None) -> None:
+    def add_all(self, snapshots: Iterable[MapSnapshot | NewestFrame], done: Callable[[DepthView], None] | None = None) -> None:
         """All keyframes that come; densified ahead of meshing, meshed ahead of the fusion."""
         with ExitStack() as threads:
             waited_for = snapshots if isinstance(snapshots, Items) else None
@@ -267,15 +267,22 @@ class _Dense:
         size, niceness = (1, DENSE_NICENESS) if self.job.live else (READ_AHEAD, 0)
         return threads.enter_context(ReadAhead(source, name, size, niceness, upstream))
 
-    def _densified(self, snapshots: Iterable[MapSnapshot]) -> Iterator[MapSnapshot]:
+    def _densified(self, snapshots: Iterable[MapSnapshot | NewestFrame]) -> Iterator[MapSnapshot | NewestFrame]:
         for snapshot in snapshots:
-            yield from self._begun().densified_ready(snapshot)
+            if isinstance(snapshot, MapSnapshot):
+                yield from self._begun().densified_ready(snapshot)
+            elif self.reconstruction is not None:
+                yield from self.reconstruction.late_densified(snapshot.timestamp_ns)
+                yield snapshot
         if self.reconstruction is not None:
             yield from self.reconstruction.last_densified()
 
-    def _views(self, snapshots: Iterable[MapSnapshot]) -> Iterator[DepthView]:
+    def _views(self, snapshots: Iterable[MapSnapshot | NewestFrame]) -> Iterator[DepthView]:
         for snapshot in snapshots:
-            yield from self._begun().drawn_ready(snapshot)
+            if isinstance(snapshot, MapSnapshot):
+                yield from self._begun().drawn_ready(snapshot)
+            else:
+                yield from self._begun().late_drawn(snapshot.timestamp_ns)
         if self.reconstruction is not None:
             yield from self.reconstruction.last_drawn()
 

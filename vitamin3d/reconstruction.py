@@ -28,6 +28,11 @@ NO_NORMALS = np.zeros((0, 0, 3), np.float32)
 """Fusion needs depth and colour; the normals of waiting views are not kept."""
 
 
+def _is_older(timestamp_ns: int, now_ns: int, seconds: float) -> bool:
+    """Whether something is older than so many seconds; never with 0."""
+    return seconds > 0 and now_ns - timestamp_ns > 1e9 * seconds
+
+
 class Reconstruction:
     """Turns keyframes into a coarse and a fine surface.
 
@@ -87,6 +92,12 @@ class Reconstruction:
     def densified_ready(self, snapshot: MapSnapshot) -> Iterator[MapSnapshot]:
         """Takes a keyframe, in the order of time; with more vertices those that have all their neighbours by now."""
         yield from map(self._densified, self._ready(snapshot))
+        yield from self.late_densified(snapshot.frame.timestamp_ns)
+
+    def late_densified(self, now_ns: int) -> Iterator[MapSnapshot]:
+        """With more vertices those that have waited too long for their neighbours, at this time of the recording."""
+        wait_s = self.config.densification.max_wait_s
+        yield from map(self._densified, self._keyframes.expire(lambda p: _is_older(p.snapshot.frame.timestamp_ns, now_ns, wait_s)))
 
     def last_densified(self) -> Iterator[MapSnapshot]:
         """Those that waited for neighbours: none will follow."""
@@ -97,6 +108,12 @@ class Reconstruction:
         view = self.depth_view(snapshot)
         if view is not None:
             yield from map(self._checked, self._drawn.push(view))
+        yield from self.late_drawn(snapshot.frame.timestamp_ns)
+
+    def late_drawn(self, now_ns: int) -> Iterator[DepthView]:
+        """The views that have waited too long for those around them, at this time of the recording."""
+        wait_s = self.config.consistency.max_wait_s
+        yield from map(self._checked, self._drawn.expire(lambda view: _is_older(view.timestamp_ns, now_ns, wait_s)))
 
     def last_drawn(self) -> Iterator[DepthView]:
         """The views that waited for those around them: none will follow."""

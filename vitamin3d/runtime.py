@@ -21,7 +21,7 @@ from vitamin3d.datasets.pictures import Unreadable
 from vitamin3d.mapping.window_adjustment import AdjustAtOnce, WindowAdjustment
 from vitamin3d.slam import Slam
 from vitamin3d.tracking.front_end import FrontEnd
-from vitamin3d.types import Array, Frame, FrontEndFrame, MapSnapshot, SlamState
+from vitamin3d.types import Array, Frame, FrontEndFrame, MapSnapshot, NewestFrame, SlamState
 from vitamin3d.workers import Clock, Consumer, Errand, ReadAhead, step
 
 READ_AHEAD = 4
@@ -31,8 +31,10 @@ ADJUSTMENT_NICENESS, DENSE_NICENESS = 3, 10
 
 KeyframeHand = Callable[[int, Frame, bool], None]
 """Takes a settled keyframe and its picture; True: the recording is over."""
-SnapshotConsumer = Callable[[Iterator[MapSnapshot]], None]
-"""Consumes keyframes as they come, on a thread of its own."""
+SnapshotConsumer = Callable[[Iterator[MapSnapshot | NewestFrame]], None]
+"""Consumes keyframes as they come, on a thread of its own; in live runs, while none comes, it hears how late it is."""
+TimeHand = Callable[[int], None]
+"""Hears of each frame's time (ns) when the frame is done."""
 SnapshotSink = Callable[[MapSnapshot], None]
 
 
@@ -91,6 +93,7 @@ class _Run:
 
     def __init__(self, slam: Slam, record: RunRecord, observer: Observer, hand: KeyframeHand, clock: Clock | None = None) -> None:
         self.slam, self.record, self.observer, self.hand, self.clock = slam, record, observer, hand, clock
+        self.tell_time: TimeHand = lambda timestamp_ns: None
 
     def all_frames(self, fronts: Iterable[FrontEndFrame | Unreadable]) -> RunRecord:
         """Frame by frame until the end, or until the observer stops it; then the last keyframes are handed over."""
@@ -115,6 +118,7 @@ class _Run:
                 self.record.latencies.append((front.frame.index, self.clock.seconds_since(front.frame.timestamp_ns)))
             self._record_tracks(front.frame.index)
             self.hand_over()
+            self.tell_time(front.frame.timestamp_ns)
         done = len(self.record.skipped) + len(self.record.states)
         self.observer.frame_done(done, self.record.num_frames, self.slam)
 
@@ -203,6 +207,8 @@ def run_live(
         if clock is not None:
             threads.callback(clock.cancel)
         run = _Run(slam, record, observer or SilentObserver(), _hand_or_drop(slam, record, dense), clock)
+        if dense is not None:
+            run.tell_time = _tell_while_waiting(dense)
         run.all_frames(fronts)
         record.adjustments_skipped = slam.adjustments_skipped
         return record
@@ -242,12 +248,21 @@ def _fronts_ahead(threads: ExitStack, pictures: Iterator[Frame | Unreadable], fr
 
 
 def _each_to(sink: SnapshotSink) -> SnapshotConsumer:
-    def consume(snapshots: Iterator[MapSnapshot]) -> None:
+    def consume(snapshots: Iterator[MapSnapshot | NewestFrame]) -> None:
         for snapshot in snapshots:
-            with step(f"meshing and fusing frame {snapshot.frame.index}"):
-                sink(snapshot)
+            if isinstance(snapshot, MapSnapshot):
+                with step(f"meshing and fusing frame {snapshot.frame.index}"):
+                    sink(snapshot)
 
     return consume
+
+
+def _tell_while_waiting(dense: Consumer) -> TimeHand:
+    def tell(timestamp_ns: int) -> None:
+        if dense.is_waiting:
+            dense.put(NewestFrame(timestamp_ns))
+
+    return tell
 
 
 def _hand_to(slam: Slam, record: RunRecord, sink: SnapshotSink | None) -> KeyframeHand:

@@ -152,7 +152,7 @@ class BundleReport:
 
 @dataclass(frozen=True)
 class MapSnapshot:
-    """A keyframe with the depths of its landmarks; the only message from the sparse to the dense half."""
+    """A keyframe with the depths of its landmarks; the message from the sparse to the dense half."""
 
     frame: Frame
     T_cam_world: Array
@@ -163,6 +163,13 @@ class MapSnapshot:
     """(N,) along z, map units."""
     relative_deviations: Array
     """(N,) standard deviation of the depth divided by the depth."""
+
+
+@dataclass(frozen=True)
+class NewestFrame:
+    """How late it is: keyframes may have waited long enough for later ones. Comes between snapshots in live runs."""
+
+    timestamp_ns: int
 
 
 @dataclass(frozen=True)

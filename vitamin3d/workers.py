@@ -55,6 +55,11 @@ class Channel:
         """Whether `put` would not wait; for the only thread that puts."""
         return not self._queue.full()
 
+    @property
+    def is_empty(self) -> bool:
+        """Whether everything that was put was taken."""
+        return self._queue.empty()
+
     def get(self) -> Any:
         """Waits for an item; what was put before the queue was closed still comes out."""
         while True:
@@ -190,6 +195,11 @@ class Consumer(_Thread):
     @property
     def has_room(self) -> bool:
         return self._channel.has_room
+
+    @property
+    def is_waiting(self) -> bool:
+        """Whether all items were taken."""
+        return self._channel.is_empty
 
     def put(self, item: Any) -> None:
         try:

@@ -150,3 +150,14 @@ def test_a_denser_keyframe_makes_a_better_surface():
         assert len(views) == (4 if enabled else 7)
         covered[enabled] = np.mean([(view.depth > 0).mean() for view in views])
     assert covered[True] > 0.8 and covered[True] > covered[False]
+
+
+def test_who_waited_too_long_goes_with_the_neighbours_there_are():
+    queue: NeighbourQueue[int] = NeighbourQueue(3, 2)
+    assert [queue.push(k) for k in range(3)] == [[], [], []]
+    (late,) = queue.expire(lambda item: item < 2)
+    assert (late.item, late.before, late.after) == (0, [], [1, 2])
+    assert queue.expire(lambda item: item < 2) == [] and queue.push(3) == [] and queue.push(4) == []
+    (ready,) = queue.push(5)
+    assert (ready.item, ready.before, ready.after) == (2, [1, 0], [3, 4, 5])
+    assert [around.item for around in queue.expire(lambda item: True)] == [4] and queue.flush() == []

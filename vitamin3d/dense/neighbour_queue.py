@@ -1,6 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """A queue that gives each of a sequence the ones before and after it."""
 
+from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Generic, TypeVar
 
@@ -30,6 +31,13 @@ class NeighbourQueue(Generic[Item]):
         """Adds one, in the order of time; those that are ready."""
         self._items.append(item)
         return self._taken(self._first + len(self._items) - self._reach)
+
+    def expire(self, is_late: Callable[[Item], bool]) -> list[Around[Item]]:
+        """Those that have waited too long, with the neighbours that are there."""
+        end = self._next
+        while end < self._first + len(self._items) and is_late(self._items[end - self._first]):
+            end += self._stride
+        return self._taken(end)
 
     def flush(self) -> list[Around[Item]]:
         """Those that still wait: none will follow."""
