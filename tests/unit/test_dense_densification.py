@@ -161,3 +161,16 @@ def test_who_waited_too_long_goes_with_the_neighbours_there_are():
     (ready,) = queue.push(5)
     assert (ready.item, ready.before, ready.after) == (2, [1, 0], [3, 4, 5])
     assert [around.item for around in queue.expire(lambda item: True)] == [4] and queue.flush() == []
+
+
+def test_parallax_and_overlap_are_those_of_the_formulas():
+    here, there = picture_of_plane(np.eye(4)), picture_of_plane(exp_se3(np.array([0.3, -0.1, 0.05, 0.02, -0.1, 0.03])))
+    one, other = (canvas_picture(s, s.frame.image, INSIDE) for s in (here, there))
+    densifier = Densifier(CAMERA, CAMERA, DensificationConfig())
+    points = CAMERA.rays_from_ideal(here.pixels) * here.depths[:, None]
+    T = there.T_cam_world @ inverse(here.T_cam_world)
+    moved = points @ T[:3, :3].T + T[:3, 3]
+    angles = [np.arccos(p @ q / np.linalg.norm(p) / np.linalg.norm(q)) for p, q in zip(points @ T[:3, :3].T, moved, strict=True)]
+    parallax, overlap = densifier._parallax_and_overlap(points, one.snapshot, other)
+    assert parallax == pytest.approx(np.degrees(np.median(angles))) and 0.3 < overlap < 1.0
+    assert overlap == CAMERA.is_inside(CAMERA.ideal_from_points(moved)).mean()

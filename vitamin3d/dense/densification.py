@@ -138,6 +138,22 @@ def _refine(image, sources, motions, camera, pixels, start, step, steps, radius,
                 score[n] = scores[k]
 
 
+@kernel
+def _look(points, T, center, intrinsics, width, height, cosines):  # type: ignore[no-untyped-def]
+    """Fills the cosines (N,) between the rays to the points (N, 3) from here and from -`center`; how many the other camera sees."""
+    fx, fy, cx, cy = intrinsics
+    num_seen = 0
+    for n in range(points.shape[0]):
+        x, y, z = points[n, 0], points[n, 1], points[n, 2]
+        a, b, c = x + center[0], y + center[1], z + center[2]
+        cosines[n] = (x * a + y * b + z * c) / (np.sqrt(x * x + y * y + z * z) * np.sqrt(a * a + b * b + c * c))
+        depth = T[2, 0] * x + T[2, 1] * y + T[2, 2] * z + T[2, 3]
+        u = fx * (T[0, 0] * x + T[0, 1] * y + T[0, 2] * z + T[0, 3]) / depth + cx
+        v = fy * (T[1, 0] * x + T[1, 1] * y + T[1, 2] * z + T[1, 3]) / depth + cy
+        num_seen += depth > 0.0 and 0.0 <= u <= width - 1 and 0.0 <= v <= height - 1
+    return num_seen
+
+
 def _flat(pictures: Array) -> Array:
     """Grey levels one after the other, with room to read sixteen from the last."""
     return np.concatenate([pictures.ravel(), np.zeros(WIDE, pictures.dtype)])
@@ -173,8 +189,9 @@ class Densifier:
         motions = np.einsum("nji,nj->ni", rotations, translations)
         small = [turned(s.reduced, self.reduced, R) for s, R in zip(sources, rotations, strict=True)]
         self._sweep = self._sweep or PlaneSweep(self.reduced, self.config)
-        swept = self._sweep.depths(picture.reduced, small, motions, self._planes(snapshot))
-        rows, columns = self._distinct(swept, self._planes(snapshot))
+        planes = self._planes(snapshot)
+        swept = self._sweep.depths(picture.reduced, small, motions, planes)
+        rows, columns = self._distinct(swept, planes)
         full = np.stack([turned(s.image, self.canvas, R) for s, R in zip(sources, rotations, strict=True)])
         pixels = REDUCTION * np.stack([columns, rows], axis=1).astype(np.int64)
         return self._joined(snapshot, *self._refined(picture, full, motions, pixels, swept.inverse_depth[rows, columns]))
@@ -194,13 +211,10 @@ class Densifier:
 
     def _parallax_and_overlap(self, points: Array, snapshot: MapSnapshot, other: CanvasPicture) -> tuple[float, float]:
         """Median angle (degrees) at the points (N, 3) between two cameras, and the share of them that the other sees."""
-        T = other.snapshot.T_cam_world @ inverse(snapshot.T_cam_world)
-        there = points @ T[:3, :3].T + T[:3, 3]
-        with np.errstate(invalid="ignore"):
-            overlap = self.canvas.is_inside(self.canvas.ideal_from_points(there)).mean()
-        rays = points + T[:3, :3].T @ T[:3, 3]
-        cosines = (points * rays).sum(axis=1) / (np.linalg.norm(points, axis=1) * np.linalg.norm(rays, axis=1))
-        return float(np.degrees(np.arccos(np.clip(np.median(cosines), -1.0, 1.0)))), float(overlap)
+        T, canvas = np.ascontiguousarray(other.snapshot.T_cam_world @ inverse(snapshot.T_cam_world)), self.canvas
+        cosines = np.empty(len(points))
+        num_seen = _look(points, T, T[:3, :3].T @ T[:3, 3], canvas.intrinsics, canvas.width, canvas.height, cosines)
+        return float(np.degrees(np.arccos(np.clip(np.median(cosines), -1.0, 1.0)))), num_seen / len(points)
 
     def _planes(self, snapshot: MapSnapshot) -> Array:
         """(D,) inverse depths around those of the landmarks."""
