@@ -12,6 +12,8 @@ import cv2
 import numpy as np
 
 from vitamin3d.config import Config, live_config, paper_config
+from vitamin3d.exporters.depth_map import counts_from_depth
+from vitamin3d.exporters.normal_map import rgb_from_normals
 from vitamin3d.geometry.camera import Camera
 from vitamin3d.mapping.landmark_statistics import point_cloud
 from vitamin3d.reconstruction import Reconstruction
@@ -89,7 +91,9 @@ def _tracked(frames: list[Frame], config: Config) -> Slam:
 def _reconstructed(slam: Slam, frames: list[Frame], config: Config) -> None:
     for backend in {config.fusion.backend, "blocks"}:
         fusion = dataclasses.replace(config.fusion, backend=backend, keyframes_for_depth=1)
-        reconstruction = Reconstruction(slam.camera, dataclasses.replace(config, fusion=fusion))
+        reconstruction = Reconstruction(slam.camera, dataclasses.replace(config, fusion=fusion), keeps_views=True)
         for keyframe, index in enumerate(slam.map.frame_indices):
-            reconstruction.add_keyframe(slam.snapshot(keyframe, frames[index]))
+            for view in reconstruction.add_keyframe(slam.snapshot(keyframe, frames[index])):
+                counts_from_depth(view.depth, 1000.0)
+                rgb_from_normals(view.normals_cam)
         reconstruction.surfaces()
