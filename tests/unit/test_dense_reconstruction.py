@@ -5,7 +5,16 @@ import numpy as np
 import pytest
 import reference_dense as reference
 
-from vitamin3d.config import Config, DelaunayConfig, DensificationConfig, FusionConfig, NltgvConfig, PhotometricConfig, SurfaceConfig
+from vitamin3d.config import (
+    Config,
+    ConsistencyConfig,
+    DelaunayConfig,
+    DensificationConfig,
+    FusionConfig,
+    NltgvConfig,
+    PhotometricConfig,
+    SurfaceConfig,
+)
 from vitamin3d.geometry.se3 import exp_se3, inverse
 from vitamin3d.reconstruction import Reconstruction
 from vitamin3d.types import StepTimes
@@ -139,3 +148,15 @@ def test_two_runs_are_equal():
     one, other = (run(count=2)[0].surfaces()[1] for _ in range(2))
     np.testing.assert_array_equal(one.vertices_world, other.vertices_world)
     np.testing.assert_array_equal(one.triangles, other.triangles)
+
+
+def test_a_keyframe_and_its_view_do_not_wait_for_ever():
+    densification, consistency = DensificationConfig(max_wait_s=1.0, keyframe_stride=1), ConsistencyConfig(max_wait_s=1.5)
+    config = dataclasses.replace(CONFIG, densification=densification, consistency=consistency)
+    reconstruction, one = Reconstruction(reference.SMALL, config), next(snapshots())
+    second, start = 1_000_000_000, one.frame.timestamp_ns
+    assert list(reconstruction.densified_ready(one)) == [] == list(reconstruction.late_densified(start + second))
+    (denser,) = reconstruction.late_densified(start + second + 1)
+    assert list(reconstruction.drawn_ready(denser)) == [] == list(reconstruction.late_drawn(start + 3 * second // 2))
+    assert [view.timestamp_ns for view in reconstruction.late_drawn(start + 2 * second)] == [start]
+    assert list(reconstruction.last_densified()) == [] == list(reconstruction.last_drawn())

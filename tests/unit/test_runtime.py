@@ -13,7 +13,7 @@ from vitamin3d.errors import WorkerError
 from vitamin3d.runtime import RunRecord, SilentObserver, median_of, run_live, run_sequential, run_threaded
 from vitamin3d.slam import Slam
 from vitamin3d.tracking.front_end import FrontEnd
-from vitamin3d.types import SlamState
+from vitamin3d.types import MapSnapshot, NewestFrame, SlamState
 from vitamin3d.workers import Clock
 
 CONFIG = Config(seed=3, window=WindowConfig(keyframes=2, anchors=3))  # a small window hands keyframes over early
@@ -190,7 +190,7 @@ def test_live_no_frame_waits_for_a_dense_half_that_does_not_keep_up(demo):
 
     def consume(snapshots):
         go.wait(30)
-        received.extend(snapshot.frame.index for snapshot in snapshots)
+        received.extend(snapshot.frame.index for snapshot in snapshots if isinstance(snapshot, MapSnapshot))
 
     class Opens(SilentObserver):
         def frame_done(self, done, total, slam):
@@ -221,6 +221,19 @@ def test_live_windows_are_adjusted_beside_the_tracking(demo):
     reference, _ = run("sequential", demo, demo.camera, 90)
     a, b = (np.linalg.norm(np.diff(s.trajectory().T_world_cam[:, :3, 3], axis=0), axis=1).sum() for s in (slam, reference))
     assert abs(a / b - 1) < 0.05
+
+
+def test_live_a_dense_half_without_work_hears_how_late_it_is(demo):
+    times, frames = [], []
+
+    def consume(snapshots):
+        for item in snapshots:
+            is_time = isinstance(item, NewestFrame)
+            (times if is_time else frames).append(item.timestamp_ns if is_time else item.frame.timestamp_ns)
+
+    run_live(demo, range(60), FrontEnd(CONFIG), Slam(demo.camera, CONFIG), consume)
+    assert len(frames) > 2 and 10 < len(times) <= 60 and times == sorted(times)
+    assert set(times) <= set(demo.timestamps_ns[:60].tolist())
 
 
 def test_pictures_come_when_they_are_due(demo):
