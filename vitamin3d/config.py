@@ -45,7 +45,7 @@ AT_LEAST_ONE = (
 class CurvatureConfig:
     """Sec. 2.1, Eq. 1."""
 
-    smoothing_sigma_px: float = 2.0
+    smoothing_sigma_px: float = 1.9
 
 
 @dataclass(frozen=True)
@@ -56,10 +56,10 @@ class ExtremaConfig:
     """Noise floor of kappa, grey levels³ per pixel⁴ of the smoothed 0–255 image."""
     min_roundness: float = 0.6
     """4 det / trace² of kappa's Hessian at the maximum: on a ridge (0) it slides, on a round hill (1) it stays; 0: all maxima."""
-    max_tracks: int = 5300
+    max_tracks: int = 9000
     refill_interval: int = 1
     """Frames between two refills with free extrema."""
-    min_distance_px: float = 4.0
+    min_distance_px: float = 3.0
     """New extrema keep this distance from live tracks and from each other."""
     border_px: int = 8
 
@@ -90,11 +90,11 @@ class ExtremaTrackingConfig:
     prediction_sigma_px: float = 3.0
     """sigma of w in Eq. 5."""
     max_steps: int = 10
-    gate_px: float = 1.05
+    gate_px: float = 1.07
     """A climb that ends farther from the prediction is a miss: where the flow is exact, a far extremum is another one."""
-    min_roundness: float = 0.4
+    min_roundness: float = 0.2
     """As of the extrema; a climb that ends on a maximum less round is a miss."""
-    coast_frames: int = 2
+    coast_frames: int = 4
     """Frames in a row that a track may live on its prediction."""
 
 
@@ -144,9 +144,9 @@ class LocalizationConfig:
 class KeyframeConfig:
     """When a frame becomes a keyframe."""
 
-    motion_px: float = 12.0
+    motion_px: float = 10.0
     """Median motion of the landmarks since the last keyframe."""
-    min_tracked_ratio: float = 0.6
+    min_tracked_ratio: float = 0.5
     """A keyframe is also due when fewer of the last keyframe's landmarks are still tracked."""
     min_gap: int = 1
 
@@ -169,8 +169,8 @@ class RecoveryConfig:
     """Frames between two searches."""
     max_view_angle_deg: float = 32.0
     max_distance_ratio: float = 1.25
-    gate_px: float = 2.0
-    min_zncc: float = 0.8
+    gate_px: float = 3.0
+    min_zncc: float = 0.84
     merge_distance: float = 0.0
     """A landmark that meets a tracked one becomes one with it where they are this near in space, relative to the depth (0.02, say);
     0: never. Of the copies of a place each is one more measurement: merging gained nothing on exact pictures and cost real ones."""
@@ -573,6 +573,7 @@ def live_config(base: Config) -> Config:
     change = dataclasses.replace
     return change(
         base,
+        extrema=change(base.extrema, max_tracks=min(5300, base.extrema.max_tracks), min_distance_px=max(4.0, base.extrema.min_distance_px)),
         keyframes=change(base.keyframes, motion_px=20.0),
         window=change(base.window, keyframes=10, anchors=min(20, base.window.anchors), settled_keyframes=2, settled_frames=10),
         bundle_adjustment=change(base.bundle_adjustment, keyframe_iterations=3, sweeps_per_frame=0),

@@ -17,9 +17,9 @@ from vitamin3d.types import Array
 
 def with_unobserved(observed: Vertices, sparse_map: SparseMap, keyframe: int, camera: Camera, config: SnapshotConfig) -> Vertices:
     """The vertices of a keyframe and, behind them, the landmarks that it sees without having observed them."""
-    if len(observed.depths) < config.occlusion_neighbours:
-        return observed
     found = vertices_of(sparse_map, _in_the_picture(sparse_map, keyframe, camera), keyframe, camera, config)
+    if len(observed.depths) < config.occlusion_neighbours or len(found.depths) == 0:
+        return observed
     visible = is_visible(found, observed, config)
     return Vertices(*(np.concatenate([one, other[visible]]) for one, other in zip(observed, found, strict=True)))
 
