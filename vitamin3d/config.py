@@ -31,6 +31,7 @@ AT_LEAST_ONE = (
     "extrema_tracking.flow_reduction",
     "initialization.history",
     "recovery.interval",
+    "bundle_adjustment.keyframe_interval",
     "window.keyframes",
     "densification.keyframe_stride",
     "densification.reach",
@@ -54,7 +55,7 @@ class ExtremaConfig:
 
     min_curvature: float = 0.15
     """Noise floor of kappa, grey levels³ per pixel⁴ of the smoothed 0–255 image."""
-    min_roundness: float = 0.6
+    min_roundness: float = 0.65
     """4 det / trace² of kappa's Hessian at the maximum: on a ridge (0) it slides, on a round hill (1) it stays; 0: all maxima."""
     max_tracks: int = 9000
     refill_interval: int = 1
@@ -90,7 +91,7 @@ class ExtremaTrackingConfig:
     prediction_sigma_px: float = 3.0
     """sigma of w in Eq. 5."""
     max_steps: int = 10
-    gate_px: float = 1.07
+    gate_px: float = 1.05
     """A climb that ends farther from the prediction is a miss: where the flow is exact, a far extremum is another one."""
     min_roundness: float = 0.2
     """As of the extrema; a climb that ends on a maximum less round is a miss."""
@@ -170,7 +171,7 @@ class RecoveryConfig:
     max_view_angle_deg: float = 32.0
     max_distance_ratio: float = 1.25
     gate_px: float = 3.0
-    min_zncc: float = 0.84
+    min_zncc: float = 0.85
     merge_distance: float = 0.0
     """A landmark that meets a tracked one becomes one with it where they are this near in space, relative to the depth (0.02, say);
     0: never. Of the copies of a place each is one more measurement: merging gained nothing on exact pictures and cost real ones."""
@@ -198,7 +199,7 @@ class RelocalizationConfig:
 class WindowConfig:
     """Which keyframes take part in an adjustment."""
 
-    keyframes: int = 20
+    keyframes: int = 40
     past: str = "anchors"
     """What holds the window: `anchors`, or `prior`: what keyframes knew when they left it (cheaper in long maps, less accurate)."""
     anchors: int = 60
@@ -220,11 +221,15 @@ class BundleAdjustmentConfig:
     keyframe_solver: str = "subspace-accelerated"
     """Solver of the window at each keyframe: `subspace-accelerated` (cameras together with the points eliminated, then each
     point alone), `schur` (the former only), `subspace` (Eq. 11–12) or `subspace-inner` (several sweeps with the same derivatives)."""
+    keyframe_interval: int = 3
+    """The window is adjusted at every so many-th keyframe: a long window now and then holds better than a short one each time."""
     keyframe_iterations: int = 6
     relative_gain: float = 1e-3
     """An adjustment ends when a step lowers the cost by less than this share."""
     frame_keyframes: int = 4
-    """Keyframes that are adjusted with every frame; those of the window before them are their anchors."""
+    """Keyframes that are adjusted with every frame;"""
+    frame_anchors: int = 16
+    """so many before them are their anchors."""
     outlier_px: float = 5.0
 
 
@@ -553,14 +558,14 @@ def paper_config() -> Config:
         localization=LocalizationConfig(prior_inlier_ratio=2.0, outlier_medians=100.0),
         recovery=RecoveryConfig(enabled=False),
         relocalization=RelocalizationConfig(enabled=False),
-        window=WindowConfig(anchors=0),
+        window=WindowConfig(keyframes=20, anchors=0),
         final_adjustment=FinalAdjustmentConfig(enabled=False),
         densification=DensificationConfig(enabled=False),
         extrapolation=ExtrapolationConfig(enabled=False),
         consistency=ConsistencyConfig(enabled=False),
         fusion=FusionConfig(max_relative_deviation=1e3),
         calibration=CalibrationConfig(refine="off"),
-        bundle_adjustment=BundleAdjustmentConfig(keyframe_solver="subspace", keyframe_iterations=20),
+        bundle_adjustment=BundleAdjustmentConfig(keyframe_interval=1, keyframe_solver="subspace", keyframe_iterations=20),
     )
 
 
@@ -576,7 +581,7 @@ def live_config(base: Config) -> Config:
         extrema=change(base.extrema, max_tracks=min(5300, base.extrema.max_tracks), min_distance_px=max(4.0, base.extrema.min_distance_px)),
         keyframes=change(base.keyframes, motion_px=20.0),
         window=change(base.window, keyframes=10, anchors=min(20, base.window.anchors), settled_keyframes=2, settled_frames=10),
-        bundle_adjustment=change(base.bundle_adjustment, keyframe_iterations=3, sweeps_per_frame=0),
+        bundle_adjustment=change(base.bundle_adjustment, keyframe_interval=1, keyframe_iterations=3, sweeps_per_frame=0),
         final_adjustment=change(base.final_adjustment, enabled=False),
         calibration=change(base.calibration, refine="off"),
         memory=change(base.memory, max_keyframes=600, max_new_tracks=60_000),

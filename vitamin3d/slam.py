@@ -39,7 +39,7 @@ from vitamin3d.types import Array, Frame, FrontEndFrame, MapSnapshot, SlamState,
 
 PATCH_STRIDE = 8
 """Of the tracks whose looks are checked in each frame."""
-UNTAKEN_WINDOWS = 4
+UNTAKEN_WINDOWS = 2
 """Pictures of keyframes that nobody takes are kept for so many windows."""
 
 
@@ -241,7 +241,8 @@ class Slam:
             self._merge_landmarks(T_cam_world)
             keyframe = self._add_keyframe(front, T_cam_world)
             triangulate_landmarks(self.map, self.camera, self.config.triangulation)
-            self._adjust_window()
+            if keyframe % self.config.bundle_adjustment.keyframe_interval == 0:
+                self._adjust_window()
             self._refine_calibration_when_due()
             self.poses.add(front.frame, keyframe, np.eye(4))
         else:
@@ -350,7 +351,7 @@ class Slam:
         with self.times.timed("bundle_adjustment_frame"):
             seen, pixels = self._seen()
             mapped = self.map.is_mapped(seen.ids)
-            window = select_frame_window(self.map, adjustment.frame_keyframes, self.config.window.keyframes)
+            window = select_frame_window(self.map, adjustment.frame_keyframes, adjustment.frame_keyframes + adjustment.frame_anchors)
             problem = build_problem(self.map, window, (T_cam_world, seen.ids[mapped], pixels[mapped]))
             solved, _ = adjust_subspace(problem, self.camera, adjustment.sigma_px, adjustment.sweeps_per_frame)
             store_solution(self.map, window, solved)
