@@ -228,7 +228,7 @@ class BundleAdjustmentConfig:
     """An adjustment ends when a step lowers the cost by less than this share."""
     frame_keyframes: int = 4
     """Keyframes that are adjusted with every frame;"""
-    frame_anchors: int = 16
+    frame_anchors: int = 36
     """so many before them are their anchors."""
     outlier_px: float = 5.0
 
