@@ -206,7 +206,8 @@ def test_live_no_frame_waits_for_a_dense_half_that_does_not_keep_up(demo):
 
 
 def test_live_windows_are_adjusted_beside_the_tracking(demo):
-    slam, record = Slam(demo.camera, CONFIG), RunRecord()
+    at_each_keyframe = dataclasses.replace(CONFIG, bundle_adjustment=dataclasses.replace(CONFIG.bundle_adjustment, keyframe_interval=1))
+    slam, record = Slam(demo.camera, at_each_keyframe), RunRecord()
     threads, solved = set(), slam._solved
 
     def watched(*task):
