@@ -205,6 +205,23 @@ def test_live_no_frame_waits_for_a_dense_half_that_does_not_keep_up(demo):
     assert set(received) <= set(slam.map.frame_indices) and received == sorted(received)
 
 
+@pytest.mark.parametrize("interval", [1, 3])
+def test_windows_are_adjusted_at_every_so_many_keyframes(demo, interval):
+    adjustment = dataclasses.replace(CONFIG.bundle_adjustment, keyframe_interval=interval)
+    config = dataclasses.replace(CONFIG, bundle_adjustment=adjustment)
+    slam, adjusted = Slam(demo.camera, config), []
+    adjust = slam._adjust_window
+
+    def watched():
+        adjusted.append(slam.map.num_keyframes - 1)
+        adjust()
+
+    slam._adjust_window = watched
+    run_sequential(demo, range(90), FrontEnd(config), slam)
+    assert len(adjusted) > 3 and adjusted[0] % interval == 0 and set(np.diff(adjusted)) == {interval}
+    assert slam.map.num_keyframes - 1 - adjusted[-1] < interval
+
+
 def test_live_windows_are_adjusted_beside_the_tracking(demo):
     at_each_keyframe = dataclasses.replace(CONFIG, bundle_adjustment=dataclasses.replace(CONFIG.bundle_adjustment, keyframe_interval=1))
     slam, record = Slam(demo.camera, at_each_keyframe), RunRecord()
