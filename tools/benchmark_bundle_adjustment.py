@@ -149,7 +149,9 @@ def record(source: str, folder: Path, keyframes: int, anchors: int, every: int, 
     """Runs the sparse half and writes window_*.npz and map.npz, the whole map before its final adjustment."""
     config = Config()
     window = dataclasses.replace(config.window, keyframes=keyframes, anchors=anchors)
-    config = dataclasses.replace(config, window=window, calibration=dataclasses.replace(config.calibration, refine="off"))
+    adjustment = dataclasses.replace(config.bundle_adjustment, keyframe_interval=1)  # so that any keyframe may be the one to save
+    calibration = dataclasses.replace(config.calibration, refine="off")
+    config = dataclasses.replace(config, window=window, bundle_adjustment=adjustment, calibration=calibration)
     dataset = open_dataset(Path(source))
     if isinstance(dataset, Unreadable):
         raise InputError(f"{source}: {dataset.reason}")
