@@ -578,7 +578,7 @@ def live_config(base: Config) -> Config:
     change = dataclasses.replace
     return change(
         base,
-        extrema=change(base.extrema, max_tracks=min(5300, base.extrema.max_tracks), min_distance_px=max(4.0, base.extrema.min_distance_px)),
+        extrema=change(base.extrema, max_tracks=min(5600, base.extrema.max_tracks)),
         keyframes=change(base.keyframes, motion_px=20.0),
         window=change(base.window, keyframes=10, anchors=min(20, base.window.anchors), settled_keyframes=2, settled_frames=10),
         bundle_adjustment=change(base.bundle_adjustment, keyframe_interval=1, keyframe_iterations=3, sweeps_per_frame=0),
