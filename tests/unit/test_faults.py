@@ -79,6 +79,9 @@ def reconstruct(monkeypatch, capsys, tmp_path):
     for name in (*ONE_THREAD_EACH, "OMP_WAIT_POLICY"):
         monkeypatch.setenv(name, os.environ.get(name, "1" if name != "OMP_WAIT_POLICY" else "passive"))
 
+    # However busy the machine, no keyframe is dropped before the one that breaks.
+    monkeypatch.setattr("vitamin3d.runtime.LIVE_SNAPSHOTS_AHEAD", 1000)
+
     def run(*options):
         monkeypatch.setattr(sys, "argv", ["vitamin3d", "reconstruct", str(DEMO), "-q", "-o", str(tmp_path / "out"), *options])
         with pytest.raises(SystemExit) as caught:
