@@ -351,7 +351,7 @@ class Slam:
         with self.times.timed("bundle_adjustment_frame"):
             seen, pixels = self._seen()
             mapped = self.map.is_mapped(seen.ids)
-            window = select_frame_window(self.map, adjustment.frame_keyframes, adjustment.frame_keyframes + adjustment.frame_anchors)
+            window = select_frame_window(self.map, adjustment.frame_keyframes, adjustment.frame_anchors)
             problem = build_problem(self.map, window, (T_cam_world, seen.ids[mapped], pixels[mapped]))
             solved, _ = adjust_subspace(problem, self.camera, adjustment.sigma_px, adjustment.sweeps_per_frame)
             store_solution(self.map, window, solved)

@@ -74,10 +74,10 @@ def select_window(sparse_map: SparseMap, config: WindowConfig) -> Window:
     return Window(np.concatenate([recent, anchors]), len(recent), fixed)
 
 
-def select_frame_window(sparse_map: SparseMap, adjusted: int, size: int) -> Window:
-    """The window of an ordinary frame: the newest keyframes, anchored to those just before them, `size` in all."""
+def select_frame_window(sparse_map: SparseMap, adjusted: int, anchors: int) -> Window:
+    """The window of an ordinary frame: the newest keyframes, anchored to so many just before them."""
     count = sparse_map.num_keyframes
-    oldest, first = max(0, count - size), max(0, count - adjusted)
+    oldest, first = max(0, count - adjusted - anchors), max(0, count - adjusted)
     keyframes = np.concatenate([np.arange(first, count), np.arange(oldest, first)])
     return Window(keyframes, count - first, 0 if oldest < first else min(1, count - 1))
 

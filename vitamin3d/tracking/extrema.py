@@ -33,12 +33,18 @@ def _mark_maxima(kappa, floor, border, is_maximum):  # type: ignore[no-untyped-d
 def roundness(kappa, u, v):  # type: ignore[no-untyped-def]
     """4 det / trace² of the Hessian of kappa at a pixel: 1 at the top of a round hill, 0 on a ridge, whose top slides along it.
 
-    Above 1 or negative nowhere on a maximum; NaN where kappa is flat.
+    Never above 1; negative where kappa rises between the pixels in one direction, NaN where it is flat.
     """
     uu = kappa[v, u + 1] - 2.0 * kappa[v, u] + kappa[v, u - 1]
     vv = kappa[v + 1, u] - 2.0 * kappa[v, u] + kappa[v - 1, u]
     uv = 0.25 * (kappa[v + 1, u + 1] - kappa[v + 1, u - 1] - kappa[v - 1, u + 1] + kappa[v - 1, u - 1])
     return 4.0 * (uu * vv - uv * uv) / ((uu + vv) * (uu + vv))
+
+
+@inlined
+def is_round(kappa, u, v, min_roundness):  # type: ignore[no-untyped-def]
+    """Whether a pixel has at least this roundness; all have, the flat ones too, where it is 0."""
+    return min_roundness <= 0.0 or roundness(kappa, u, v) >= min_roundness
 
 
 @kernel
@@ -47,7 +53,7 @@ def _list_marked(kappa, places, min_roundness, extrema, strengths):  # type: ign
     width, count = kappa.shape[1], 0
     for i in range(places.shape[0]):
         v, u = places[i] // width, places[i] % width
-        if min_roundness > 0.0 and not roundness(kappa, u, v) >= min_roundness:
+        if not is_round(kappa, u, v, min_roundness):
             continue
         extrema[count, 0], extrema[count, 1] = u, v
         strengths[count] = -kappa[v, u]

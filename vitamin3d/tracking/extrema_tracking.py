@@ -5,7 +5,7 @@ import numpy as np
 
 from vitamin3d._jit import inlined, kernel
 from vitamin3d.config import ExtremaTrackingConfig
-from vitamin3d.tracking.extrema import roundness, subpixel_offset
+from vitamin3d.tracking.extrema import is_round, subpixel_offset
 from vitamin3d.types import Array, DominantFlow, Tracks
 
 
@@ -41,9 +41,7 @@ def _climb_all(kappa, predicted, weight, sigma, max_steps, gate, min_roundness, 
         if not (u >= 1 and v >= 1 and u < width - 1 and v < height - 1):
             continue
         u, v, is_maximum = climb(kappa, u, v, pu, pv, weight, sigma * sigma, max_steps)
-        if not is_maximum or not kappa[v, u] > 0.0:
-            continue
-        if min_roundness > 0.0 and not roundness(kappa, u, v) >= min_roundness:
+        if not is_maximum or not kappa[v, u] > 0.0 or not is_round(kappa, u, v, min_roundness):
             continue
         x = u + subpixel_offset(kappa[v, u - 1], kappa[v, u], kappa[v, u + 1])
         y = v + subpixel_offset(kappa[v - 1, u], kappa[v, u], kappa[v + 1, u])
