@@ -199,7 +199,7 @@ class RelocalizationConfig:
 class WindowConfig:
     """Which keyframes take part in an adjustment."""
 
-    keyframes: int = 40
+    keyframes: int = 24
     past: str = "anchors"
     """What holds the window: `anchors`, or `prior`: what keyframes knew when they left it (cheaper in long maps, less accurate)."""
     anchors: int = 60
@@ -226,10 +226,15 @@ class BundleAdjustmentConfig:
     keyframe_iterations: int = 6
     relative_gain: float = 1e-3
     """An adjustment ends when a step lowers the cost by less than this share."""
+    points_per_keyframe: int = 400
+    """About so many points of each keyframe, those of the longest tracks, are adjusted together with the cameras at a keyframe;
+    the others are then moved to them. 0: all."""
     frame_keyframes: int = 4
     """Keyframes that are adjusted with every frame;"""
     frame_anchors: int = 36
     """so many before them are their anchors."""
+    frame_points: int = 1000
+    """About so many of the frame's landmarks take part, those with the most observations; 0: all landmarks that the keyframes see."""
     outlier_px: float = 5.0
 
 
@@ -241,7 +246,7 @@ class FinalAdjustmentConfig:
     sigma_px: float = 1.0
     outlier_px: float = 3.0
     iterations: int = 6
-    relative_gain: float = 1e-3
+    relative_gain: float = 3e-3
     max_keyframes: int = 1000
     """Longer maps are left as they are: the reduced camera system grows with the square of the keyframes."""
 
@@ -255,16 +260,20 @@ class CalibrationConfig:
     parameters: str = "f k1"
     """Free ones out of f fx fy cx cy k1 k2 p1 p2; `f` moves fx and fy together."""
     first_keyframes: int = 20
-    growth: float = 1.5
+    growth: float = 2.0
     """The next refinement is due when the map has grown by this factor; one more comes at the end."""
+    max_keyframes: int = 120
+    """Of a longer map so many keyframes take part, spread evenly; the others are then moved to the new camera."""
     readout: bool = True
     """The readout time of a rolling shutter is looked for as well."""
     readout_points: int = 150
     """Landmarks per keyframe that take part in that."""
+    readout_blocks: int = 3
+    """Of 60 consecutive keyframes, spread over the map: so many at most."""
     readout_systematic_factor: float = 5.0
     max_readout_deviation: float = 0.3
     """In intervals between two frames, systematic errors included; above it the motion does not determine the readout time."""
-    points_per_keyframe: int = 400
+    points_per_keyframe: int = 200
     """Landmarks with the most observations that take part, about so many in each keyframe."""
     sigma_px: float = 1.0
     iterations: int = 12

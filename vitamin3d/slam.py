@@ -2,10 +2,11 @@
 """Tracking, localisation and mapping on one page (Fig. 2a–b of the paper): `Slam.process_frame`, top to bottom."""
 
 from dataclasses import replace
+from functools import partial
 
 import numpy as np
 
-from vitamin3d.bundle_adjustment.adjust import adjust_bundle
+from vitamin3d.bundle_adjustment.adjust import adjust_bundle, adjust_by_long_tracks
 from vitamin3d.bundle_adjustment.marginalization import CameraPrior
 from vitamin3d.bundle_adjustment.problem import BundleProblem
 from vitamin3d.bundle_adjustment.schur import adjust_accelerated
@@ -32,7 +33,15 @@ from vitamin3d.mapping.two_view_initialization import initialize_from_two_views
 from vitamin3d.mapping.visible_landmarks import with_unobserved
 from vitamin3d.mapping.window_adjustment import AdjustAtOnce, Adjuster, WindowAdjustment, store_adjustment
 from vitamin3d.mapping.window_prior import WindowPrior
-from vitamin3d.mapping.window_selection import Window, build_problem, select_frame_window, select_window, store_solution, whole_map
+from vitamin3d.mapping.window_selection import (
+    Window,
+    build_problem,
+    most_observed,
+    select_frame_window,
+    select_window,
+    store_solution,
+    whole_map,
+)
 from vitamin3d.tracking.extrema import refine_extrema, select_free_extrema
 from vitamin3d.tracking.extrema_tracking import predict_by_dense_flow, predict_by_dominant_flow, track_extrema
 from vitamin3d.types import Array, Frame, FrontEndFrame, MapSnapshot, SlamState, StepTimes, Tracks, Trajectory
@@ -62,6 +71,10 @@ class Slam:
         self._pending_frames: dict[int, Frame] = {}
         self._meetings: list[Array] = []
         self._image_motion, self._last_ns = NO_MOTION, 0
+        self._last_seen: tuple[tuple[Tracks, Array, Camera], tuple[Tracks, Array]] = (
+            (self.tracks, self._image_motion, camera),
+            (self.tracks, np.zeros((0, 2))),
+        )
         self._next_id = 0
         self._unique_ids, self._num_condensed, self._num_forgotten = np.zeros(0, np.int64), 0, 0
         self._frame_count = 0
@@ -122,10 +135,20 @@ class Slam:
 
     def _seen(self) -> tuple[Tracks, Array]:
         """The tracks that do not coast, and their ideal pixels."""
+        at = self.tracks, self._image_motion, self.camera
+        if not all(a is b for a, b in zip(at, self._last_seen[0], strict=True)):
+            self._last_seen = at, self._compute_seen()
+        return self._last_seen[1]
+
+    def _compute_seen(self) -> tuple[Tracks, Array]:
         seen = self.tracks.select(self.tracks.missed == 0)
         pixels = ideal_pixels(seen.pixels, self._image_motion, self.camera)
         valid = np.isfinite(pixels[:, 0])
         return seen.select(valid), pixels[valid]
+
+    def _end_tracks(self, ids: Array) -> None:
+        if len(ids):
+            self.tracks = self.tracks.select(~np.isin(self.tracks.ids, ids, kind="table"))
 
     # --- initialisation and localisation (Sec. 5.1) ------------------------------------------------------------
 
@@ -173,7 +196,7 @@ class Slam:
             self.tracks = Tracks.empty()
             return self._find_camera(front)
         self.state = SlamState.TRACKING
-        self.tracks = self.tracks.select(~np.isin(self.tracks.ids, ids[~found.is_inlier]))
+        self._end_tracks(ids[~found.is_inlier])
         recovery = self.config.recovery
         if recovery.enabled and self._frame_count % recovery.interval == 0 and self._recover(front, found.T_cam_world):
             return self._relocalize(found.T_cam_world)
@@ -220,7 +243,7 @@ class Slam:
         recovery = recovery if gate_px is None else replace(recovery, gate_px=gate_px)
         self.tracks, meetings = recover_landmarks(self.tracks, self.map, image, front.kappa, motion, T_cam_world, self.camera, recovery)
         self._meetings.append(meetings)
-        return int((~np.isin(self.tracks.ids, before)).sum())
+        return int((~np.isin(self.tracks.ids, before, kind="table")).sum())
 
     def _relocalize(self, T_cam_world: Array) -> Array:
         """The pose refined with the landmarks that were found again."""
@@ -230,7 +253,7 @@ class Slam:
         found = localize(self.map.points_world[ids], pixels[mapped], T_cam_world, self.camera, self.config.localization)
         if not found.converged:
             return T_cam_world
-        self.tracks = self.tracks.select(~np.isin(self.tracks.ids, ids[~found.is_inlier]))
+        self._end_tracks(ids[~found.is_inlier])
         return found.T_cam_world
 
     # --- mapping (Sec. 3) --------------------------------------------------------------------------------------
@@ -252,12 +275,12 @@ class Slam:
     def _is_keyframe(self, frame: Frame) -> bool:
         seen, pixels = self._seen()
         last = self.map.num_keyframes - 1
-        rows = self.map.observations_of(last)
-        ids = self.map.obs_landmark[rows]
-        mapped = np.flatnonzero(self.map.is_mapped(ids) & self.map.obs_valid[rows])
-        _, a, b = np.intersect1d(ids[mapped], seen.ids, assume_unique=True, return_indices=True)
+        rows, mapped = self.map.observations_of(last), self.map.is_mapped(seen.ids)
+        count = (self.map.is_mapped(self.map.obs_landmark[rows]) & self.map.obs_valid[rows]).sum()
+        now, then = pixels[mapped], self.map.last_observation[seen.ids[mapped]]
+        both = (then >= rows.start) & self.map.obs_valid[then]
         gap = frame.index - self.map.frame_indices[last]
-        return is_keyframe(self.map.obs_pixels[rows][mapped[a]], pixels[b], len(mapped), gap, self.config.keyframes)
+        return is_keyframe(self.map.obs_pixels[then[both]], now[both], int(count), gap, self.config.keyframes)
 
     def _add_keyframe(self, front: FrontEndFrame, T_cam_world: Array) -> int:
         keyframe = add_view(self.map, TrackedView(front.frame, *self._seen(), self._image_motion), T_cam_world)
@@ -341,18 +364,18 @@ class Slam:
         is_newest = solved.obs_camera == window.num_adjusted - 1
         self.map.remove_observations(solved.obs_rows[is_outlier])
         ended = solved.landmark_ids[solved.obs_point[is_outlier & is_newest]]
-        self.tracks = self.tracks.select(~np.isin(self.tracks.ids, ended))
+        self._end_tracks(ended)
 
     def _adjust_with_frame(self, T_cam_world: Array) -> Array:
-        """A few sweeps of subspace Gauss–Newton over the newest frame, keyframes and landmarks; the frame's pose."""
+        """A few sweeps of subspace Gauss–Newton over the newest frame, keyframes and its landmarks; the frame's pose."""
         adjustment = self.config.bundle_adjustment
         if adjustment.sweeps_per_frame == 0:
             return T_cam_world
         with self.times.timed("bundle_adjustment_frame"):
             seen, pixels = self._seen()
-            mapped = self.map.is_mapped(seen.ids)
+            used = most_observed(self.map, seen.ids, adjustment.frame_points)
             window = select_frame_window(self.map, adjustment.frame_keyframes, adjustment.frame_anchors)
-            problem = build_problem(self.map, window, (T_cam_world, seen.ids[mapped], pixels[mapped]))
+            problem = build_problem(self.map, window, (T_cam_world, seen.ids[used], pixels[used]), adjustment.frame_points > 0)
             solved, _ = adjust_subspace(problem, self.camera, adjustment.sigma_px, adjustment.sweeps_per_frame)
             store_solution(self.map, window, solved)
         return np.asarray(solved.T_cam_world[-1])
@@ -364,13 +387,18 @@ class Slam:
             return
         if self.calibration.is_enabled:
             self._refine_calibration()
-        everything = whole_map(self.map)
         with self.times.timed("final_adjustment"):
-            for sigma, outlier in ((window_round.sigma_px, window_round.outlier_px), (final.sigma_px, final.outlier_px)):
-                problem = build_problem(self.map, everything)
-                solved, _ = adjust_accelerated(problem, self.camera, sigma, final.iterations, final.relative_gain)
-                store_solution(self.map, everything, solved)
-                self._remove_outliers(everything, solved, outlier)
+            self._adjust_whole_map(window_round.sigma_px, window_round.outlier_px, window_round.points_per_keyframe)
+            self._adjust_whole_map(final.sigma_px, final.outlier_px, per_keyframe=0)
+
+    def _adjust_whole_map(self, sigma_px: float, outlier_px: float, per_keyframe: int) -> None:
+        final, everything = self.config.final_adjustment, whole_map(self.map)
+        solver = partial(
+            adjust_accelerated, camera=self.camera, sigma_px=sigma_px, iterations=final.iterations, relative_gain=final.relative_gain
+        )
+        solved, _ = adjust_by_long_tracks(build_problem(self.map, everything), self.camera, sigma_px, per_keyframe, solver)
+        store_solution(self.map, everything, solved)
+        self._remove_outliers(everything, solved, outlier_px)
 
     # --- what leaves ---------------------------------------------------------------------------------------------
 

@@ -84,6 +84,8 @@ class Tracks:
 
     def select(self, keep: Array | slice) -> "Tracks":
         """The tracks of a mask (N,) bool, of indices, or of a slice."""
+        if isinstance(keep, np.ndarray) and keep.dtype == np.bool_:
+            keep = np.flatnonzero(keep)  # five times an index costs less than five times a mask
         return Tracks(self.ids[keep], self.pixels[keep], self.kappa[keep], self.ages[keep], self.missed[keep])
 
     def renamed(self, old: Array, new: Array) -> "Tracks":

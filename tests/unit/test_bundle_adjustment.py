@@ -10,8 +10,9 @@ from scipy.sparse import lil_matrix
 from scipy.spatial.transform import Rotation
 
 from vitamin3d.bundle_adjustment import subspace
-from vitamin3d.bundle_adjustment.adjust import SOLVERS, adjust_bundle
+from vitamin3d.bundle_adjustment.adjust import SOLVERS, adjust_bundle, adjust_by_long_tracks
 from vitamin3d.bundle_adjustment.observations import total_cost
+from vitamin3d.bundle_adjustment.problem import points_of_long_tracks, select_points
 from vitamin3d.bundle_adjustment.schur import ReducedSystem, adjust_schur
 from vitamin3d.bundle_adjustment.subspace import adjust_subspace, new_scratch, sweep_cameras, sweep_points
 from vitamin3d.bundle_adjustment.variables import (
@@ -255,8 +256,28 @@ def test_no_iterations_change_nothing_but_measure(start):
 
 def test_the_settings_name_the_solver(start):
     for name, solver in (("schur", adjust_schur), ("subspace", adjust_subspace)):
-        config = BundleAdjustmentConfig(sigma_px=1.5, keyframe_solver=name, keyframe_iterations=2)
+        config = BundleAdjustmentConfig(sigma_px=1.5, keyframe_solver=name, keyframe_iterations=2, points_per_keyframe=0)
         np.testing.assert_array_equal(adjust_bundle(start, PINHOLE, config)[0].points_world, solver(start, PINHOLE, 1.5, 2)[0].points_world)
+
+
+def test_cameras_and_long_tracks_first_then_the_other_points(noisy, start):
+    """Cameras and chosen points as if they were the whole problem; then each point at its own minimum, none left behind."""
+    chosen = points_of_long_tracks(start, 60)
+    assert 60 < chosen.sum() < 0.7 * len(chosen)
+    part, _ = adjust_schur(select_points(start, chosen), PINHOLE, SIGMA, 30)
+    solved, report = adjust_by_long_tracks(start, PINHOLE, SIGMA, 60, lambda problem: adjust_schur(problem, PINHOLE, SIGMA, 30))
+    np.testing.assert_array_equal(solved.camera_is_free, start.camera_is_free)
+    np.testing.assert_allclose(solved.T_cam_world, part.T_cam_world, atol=1e-12)
+    assert report.num_observations == len(part.obs_point)
+    held = dataclasses.replace(solved, camera_is_free=np.zeros(len(solved.T_cam_world), np.bool_))
+    best, _ = adjust_subspace(held, PINHOLE, SIGMA, 30, 1e-12)
+    everything, _ = adjust_schur(start, PINHOLE, SIGMA, 30)
+    assert cost_of(solved) < 1.01 * cost_of(best) and cost_of(solved) < 1.05 * cost_of(everything) < 0.2 * cost_of(start)
+
+
+def test_no_limit_is_the_plain_solver(start):
+    solved, _ = adjust_by_long_tracks(start, PINHOLE, SIGMA, 0, lambda problem: adjust_schur(problem, PINHOLE, SIGMA, 2))
+    np.testing.assert_array_equal(solved.points_world, adjust_schur(start, PINHOLE, SIGMA, 2)[0].points_world)
 
 
 def test_a_sweep_allocates_nothing(start):

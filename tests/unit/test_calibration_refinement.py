@@ -42,6 +42,18 @@ def test_a_wrong_calibration_is_replaced_and_the_whole_map_moves_along(true, rng
     assert np.median(errors) < 0.35 and np.percentile(errors, 99) < 1.5
 
 
+def test_the_keyframes_that_took_no_part_move_along(rng):
+    wrong = EUROC.with_model(EUROC.model * [1.03, 1.03, 1, 1, 1, 1, 1, 1])
+    sparse_map, measured = map_seen_through(EUROC, wrong, rng)
+    most = sparse_map.num_keyframes // 2
+    found = CalibrationRefinement(wrong, dataclasses.replace(CONFIG, max_keyframes=most, points_per_keyframe=200)).refine(sparse_map, wrong)
+    assert most > 4 and abs(found.fx / EUROC.fx - 1.0) < 0.005
+    np.testing.assert_allclose(found.distort(sparse_map.obs_pixels), measured, atol=1e-6)
+    errors = errors_of(sparse_map, found)
+    medians = [np.median(errors[sparse_map.observations_of(k)]) for k in range(sparse_map.num_keyframes)]
+    assert max(medians) < 0.4 and np.percentile(errors, 99) < 1.5
+
+
 def test_a_right_calibration_is_kept_as_it_is(rng):
     sparse_map, _ = map_seen_through(PINHOLE, PINHOLE, rng)
     before = sparse_map.obs_pixels.copy(), sparse_map.points_world.copy()
@@ -97,5 +109,5 @@ def test_refinements_are_due_as_the_map_grows(rng):
     refinement = CalibrationRefinement(PINHOLE, CONFIG)
     assert [refinement.is_due(n) for n in (4, 5, 12)] == [False, True, True]
     refinement.refine(sparse_map, PINHOLE)
-    assert [refinement.is_due(n) for n in (12, 17, 18)] == [False, False, True]
+    assert [refinement.is_due(n) for n in (12, 23, 24)] == [False, False, True]
     assert not CalibrationRefinement(PINHOLE, dataclasses.replace(CONFIG, refine="off")).is_due(100)

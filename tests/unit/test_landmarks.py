@@ -12,7 +12,14 @@ from vitamin3d.config import CloudConfig, CurvatureConfig, ExtremaConfig, Recove
 from vitamin3d.geometry.camera import Camera
 from vitamin3d.geometry.rolling_shutter import NO_MOTION
 from vitamin3d.geometry.se3 import exp_se3, inverse
-from vitamin3d.mapping.landmark_recovery import _climb_strict, cut_patches, patch_similarity, recover_landmarks, same_landmarks
+from vitamin3d.mapping.landmark_recovery import (
+    _climb_strict,
+    _visible_candidates,
+    cut_patches,
+    patch_similarity,
+    recover_landmarks,
+    same_landmarks,
+)
 from vitamin3d.mapping.landmark_statistics import (
     keyframe_vertices,
     landmark_information,
@@ -135,6 +142,37 @@ def test_landmarks_are_found_where_they_project(wall):
     assert len(np.unique(found.ids)) == len(found)
 
 
+def candidate_twin(sparse_map, live_ids, T, camera, config):
+    """Landmark by landmark: mapped, seen often enough, not live, in the picture, seen from near where it was seen last."""
+    canvas, center, found = camera.canvas(), inverse(T)[:3, 3], []
+    for id_, point in enumerate(sparse_map.points_world):
+        if id_ in live_ids or sparse_map.num_observations[id_] < config.min_observations or np.isnan(point[0]):
+            continue
+        x, y, z = T[:3, :3] @ point + T[:3, 3]
+        if z <= 0 or not 0 < camera.fx * x / z + canvas.cx < canvas.width or not 0 < camera.fy * y / z + canvas.cy < canvas.height:
+            continue
+        k = sparse_map.keyframe_of(sparse_map.last_observation[[id_]])[0]
+        then, now = point - inverse(sparse_map.T_cam_world[k])[:3, 3], point - center
+        far, near = sorted((np.linalg.norm(then), np.linalg.norm(now)), reverse=True)
+        if np.degrees(np.arccos(then @ now / (far * near))) < config.max_view_angle_deg and far < config.max_distance_ratio * near:
+            found.append(id_)
+    return found
+
+
+def test_candidates_equal_their_twin(rng):
+    ways = [exp_se3(0.3 * rng.standard_normal(6) * [1, 1, 1, 0.3, 0.3, 0.3]) for _ in range(6)]
+    sparse_map, n = SparseMap(), 400
+    for k, T in enumerate(ways[:5]):
+        ids = rng.permutation(n)[:250]
+        empty = np.zeros((250, 2)), np.zeros((250, 3), np.uint8), np.zeros((250, 81), np.uint8)
+        sparse_map.add_keyframe(k, k, T, ids, *empty)
+    sparse_map.points_world[:] = rng.standard_normal((n, 3)) * [1.0, 0.8, 2.0] + [0, 0, 1.5]
+    sparse_map.points_world[::9] = np.nan
+    live = np.array([2, 5, 7, n + 3])
+    found = _visible_candidates(sparse_map, live, ways[5], CAMERA, CONFIG)
+    assert found.tolist() == candidate_twin(sparse_map, live, ways[5], CAMERA, CONFIG) and 20 < len(found) < 200
+
+
 def test_a_patch_that_disagrees_is_not_found(wall, rng):
     ids = set(recovered(wall).ids.tolist())
     spoilt = np.array(sorted(ids))[::3]
@@ -184,6 +222,7 @@ def test_landmarks_that_meet_are_one_where_they_are_near_in_space(wall):
     same = same_landmarks(np.concatenate([meetings, meetings]), tracks, sparse_map, MOVED, 0.02)
     assert sorted(same.tolist()) == sorted([a, b] for a, b in zip(ids.tolist()[:3], impostors.tolist()[:3], strict=True))
     assert len(same_landmarks(meetings, tracks.select(slice(0, 0)), sparse_map, MOVED, 0.02)) == 0  # no more tracked
+    assert same_landmarks(meetings, tracks, sparse_map, MOVED, 0.0).shape == (0, 2)
 
 
 @pytest.mark.parametrize(("turn_deg", "is_found"), [(25.0, True), (40.0, False)])

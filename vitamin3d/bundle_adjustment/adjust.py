@@ -15,7 +15,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from vitamin3d.bundle_adjustment.marginalization import CameraPrior
-from vitamin3d.bundle_adjustment.problem import BundleProblem
+from vitamin3d.bundle_adjustment.problem import BundleProblem, points_of_long_tracks, select_points
 from vitamin3d.bundle_adjustment.rejection import Rejection, reject
 from vitamin3d.bundle_adjustment.schur import ReducedSystem, adjust_accelerated, adjust_schur, minimise
 from vitamin3d.bundle_adjustment.self_calibration import parameter_basis
@@ -33,6 +33,9 @@ SOLVERS: dict[str, Callable[[BundleProblem, Camera, float, int, float], tuple[Bu
     "schur": adjust_schur,
 }
 """The tracker's way in: problem in ideal pixels, camera, sigma_px, the most iterations, the relative gain that ends them."""
+
+POINT_SWEEPS = 2
+"""Over the points that were not adjusted together with the cameras."""
 
 
 @dataclass(frozen=True)
@@ -158,7 +161,33 @@ def adjust_bundle(
     problem: BundleProblem, camera: Camera, config: BundleAdjustmentConfig, prior: CameraPrior | None = None
 ) -> tuple[BundleProblem, BundleReport]:
     """The window's adjustment at a keyframe, by the solver that the settings name; a prior needs one that eliminates points."""
-    if prior is not None:
-        solver = adjust_schur if config.keyframe_solver == "schur" else adjust_accelerated
-        return solver(problem, camera, config.sigma_px, config.keyframe_iterations, config.relative_gain, prior)
-    return SOLVERS[config.keyframe_solver](problem, camera, config.sigma_px, config.keyframe_iterations, config.relative_gain)
+
+    def solve(part: BundleProblem) -> tuple[BundleProblem, BundleReport]:
+        if prior is not None:
+            solver = adjust_schur if config.keyframe_solver == "schur" else adjust_accelerated
+            return solver(part, camera, config.sigma_px, config.keyframe_iterations, config.relative_gain, prior)
+        return SOLVERS[config.keyframe_solver](part, camera, config.sigma_px, config.keyframe_iterations, config.relative_gain)
+
+    return adjust_by_long_tracks(problem, camera, config.sigma_px, config.points_per_keyframe, solve)
+
+
+def adjust_by_long_tracks(
+    problem: BundleProblem,
+    camera: Camera,
+    sigma_px: float,
+    per_camera: int,
+    solve: Callable[[BundleProblem], tuple[BundleProblem, BundleReport]],
+) -> tuple[BundleProblem, BundleReport]:
+    """Cameras and the points that they see longest by `solve`, about `per_camera` of each; then the other points (Eq. 12).
+
+    With per_camera = 0 all points take part in `solve`. The report is that of `solve`.
+    """
+    if not per_camera:
+        return solve(problem)
+    chosen = points_of_long_tracks(problem, per_camera)
+    part, report = solve(select_points(problem, chosen))
+    points = np.array(problem.points_world)
+    points[chosen] = part.points_world
+    held = np.zeros(len(problem.T_cam_world), np.bool_)
+    placed = dataclasses.replace(problem, T_cam_world=part.T_cam_world, points_world=points, camera_is_free=held)
+    return dataclasses.replace(adjust_subspace(placed, camera, sigma_px, POINT_SWEEPS)[0], camera_is_free=problem.camera_is_free), report

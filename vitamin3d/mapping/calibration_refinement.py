@@ -16,9 +16,11 @@ from vitamin3d.bundle_adjustment.subspace import adjust_subspace
 from vitamin3d.config import CalibrationConfig
 from vitamin3d.geometry.camera import Camera
 from vitamin3d.geometry.rolling_shutter import ideal_pixels, measured_pixels
+from vitamin3d.geometry.se3 import inverse
 from vitamin3d.mapping.readout_estimation import estimate_readout, frame_interval_s
 from vitamin3d.mapping.sparse_map import SparseMap
-from vitamin3d.mapping.window_selection import build_problem, store_solution, whole_map
+from vitamin3d.mapping.window_selection import Window, build_problem, spread_over_map, store_solution, whole_map
+from vitamin3d.types import Array
 
 POINT_SWEEPS = 2
 POINT_SIGMAS = (16.0, 4.0, 1.0)
@@ -68,7 +70,8 @@ class CalibrationRefinement:
         return self._refine_readout(sparse_map, camera) if self.wants_image_motion and sparse_map.image_motions.any() else camera
 
     def _refine_intrinsics(self, sparse_map: SparseMap, camera: Camera) -> Camera:
-        problem = build_problem(sparse_map, whole_map(sparse_map))
+        window = spread_over_map(sparse_map, self.config.max_keyframes)
+        problem = build_problem(sparse_map, window)
         chosen = points_of_long_tracks(problem, self.config.points_per_keyframe)
         free = tuple(self.config.parameters.split())
         priors = {"f": self.config.prior_focal * camera.fx, "k1": self.config.prior_distortion}
@@ -80,7 +83,7 @@ class CalibrationRefinement:
         self.history.append(Refinement(sparse_map.num_keyframes, refined if not reason else camera, deviations, not reason, reason))
         if reason:
             return camera
-        _change_camera(sparse_map, camera, refined, self.config, solved)
+        _change_camera(sparse_map, camera, refined, self.config, (window, solved))
         return refined
 
     def _refine_readout(self, sparse_map: SparseMap, camera: Camera) -> Camera:
@@ -125,17 +128,30 @@ class CalibrationRefinement:
         return float(np.sqrt(moved @ np.linalg.solve(report.covariance, moved))) / self.config.systematic_factor
 
 
-def _change_camera(sparse_map: SparseMap, old: Camera, new: Camera, config: CalibrationConfig, chosen: BundleProblem | None = None) -> None:
-    """Turns the map's ideal pixels into those of another camera, writes the `chosen` points' solution, and moves the points to it."""
+def _change_camera(
+    sparse_map: SparseMap, old: Camera, new: Camera, config: CalibrationConfig, solution: tuple[Window, BundleProblem] | None = None
+) -> None:
+    """Turns the map's ideal pixels into those of another camera, writes the `solution`, and moves all else to it."""
     for k, motion in enumerate(sparse_map.image_motions):
         rows = sparse_map.observations_of(k)
         sparse_map.obs_pixels[rows] = ideal_pixels(measured_pixels(sparse_map.obs_pixels[rows], motion, old), motion, new)
     sparse_map.remove_observations(np.flatnonzero(np.isnan(sparse_map.obs_pixels[:, 0])))
+    is_free = np.zeros(sparse_map.num_keyframes, np.bool_)
+    if solution is not None:
+        is_free = _store_with_neighbours(sparse_map, *solution)
     window = whole_map(sparse_map)
-    if chosen is not None:
-        store_solution(sparse_map, window, chosen)
-    problem = build_problem(sparse_map, window)
-    problem = dataclasses.replace(problem, camera_is_free=np.zeros(len(problem.T_cam_world), np.bool_))
+    problem = dataclasses.replace(build_problem(sparse_map, window), camera_is_free=is_free)
     for sigma in POINT_SIGMAS:
         problem, _ = adjust_subspace(problem, new, sigma * config.sigma_px, POINT_SWEEPS)
     store_solution(sparse_map, window, problem)
+
+
+def _store_with_neighbours(sparse_map: SparseMap, window: Window, solved: BundleProblem) -> Array:
+    """Stores the solution of some keyframes; each other one moves with the last of them before it: which those are (K,)."""
+    before = np.searchsorted(window.keyframes, np.arange(sparse_map.num_keyframes), side="right") - 1
+    T_cam_before = sparse_map.T_cam_world @ inverse(sparse_map.T_cam_world[window.keyframes])[before]
+    store_solution(sparse_map, window, solved)
+    is_other = np.ones(sparse_map.num_keyframes, np.bool_)
+    is_other[window.keyframes] = False
+    sparse_map.T_cam_world[is_other] = (T_cam_before @ sparse_map.T_cam_world[window.keyframes][before])[is_other]
+    return is_other

@@ -7,7 +7,6 @@ from vitamin3d._jit import kernel
 from vitamin3d.config import RecoveryConfig
 from vitamin3d.geometry.camera import Camera
 from vitamin3d.geometry.rolling_shutter import measured_pixels
-from vitamin3d.geometry.se3 import inverse
 from vitamin3d.mapping.sparse_map import PATCH_PX, SparseMap
 from vitamin3d.tracking.extrema import subpixel_offset
 from vitamin3d.tracking.extrema_tracking import climb
@@ -69,26 +68,50 @@ def patch_similarity(a: Array, b: Array) -> Array:
     return out
 
 
+@kernel
+def _list_candidates(  # type: ignore[no-untyped-def]
+    points, num_observations, last_observation, is_live, keyframe_starts, poses, pose, view, min_observations, min_cosine, max_ratio, ids
+):
+    """Writes the ids of landmarks that `_visible_candidates` is about, and returns how many; `view` is fx fy cx cy width height."""
+    fx, fy, cx, cy, width, height = view
+    count = 0
+    for p in range(points.shape[0]):
+        if is_live[p] or num_observations[p] < min_observations or np.isnan(points[p, 0]):
+            continue
+        x, y, z = points[p]
+        depth = pose[2, 0] * x + pose[2, 1] * y + pose[2, 2] * z + pose[2, 3]
+        u = fx * (pose[0, 0] * x + pose[0, 1] * y + pose[0, 2] * z + pose[0, 3]) + cx * depth
+        v = fy * (pose[1, 0] * x + pose[1, 1] * y + pose[1, 2] * z + pose[1, 3]) + cy * depth
+        if not (depth > 0.0 and u > 0.0 and v > 0.0 and u < width * depth and v < height * depth):
+            continue
+        then = poses[np.searchsorted(keyframe_starts, last_observation[p], side="right") - 1]
+        dot, squared_then, squared_now = 0.0, 0.0, 0.0
+        for i in range(3):
+            a, b = 0.0, 0.0
+            for m in range(3):
+                a += then[m, i] * (then[m, 0] * x + then[m, 1] * y + then[m, 2] * z + then[m, 3])
+                b += pose[m, i] * (pose[m, 0] * x + pose[m, 1] * y + pose[m, 2] * z + pose[m, 3])
+            dot, squared_then, squared_now = dot + a * b, squared_then + a * a, squared_now + b * b
+        if not dot > min_cosine * np.sqrt(squared_then * squared_now):
+            continue
+        if squared_now < max_ratio**2 * squared_then and squared_then < max_ratio**2 * squared_now:
+            ids[count] = p
+            count += 1
+    return count
+
+
 def _visible_candidates(sparse_map: SparseMap, live_ids: Array, T_cam_world: Array, camera: Camera, config: RecoveryConfig) -> Array:
     """Ids of landmarks, not tracked now, that were last seen from a similar direction and distance."""
-    wanted = (sparse_map.num_observations >= config.min_observations) & ~np.isnan(sparse_map.points_world[:, 0])
-    wanted[live_ids[live_ids < len(wanted)]] = False
-    ids = np.flatnonzero(wanted)
-    points = sparse_map.points_world[ids]
-    in_camera = points @ T_cam_world[:3, :3].T + T_cam_world[:3, 3]
-    canvas = camera.canvas()
-    u = camera.fx * in_camera[:, 0] + (canvas.cx) * in_camera[:, 2]
-    v = camera.fy * in_camera[:, 1] + (canvas.cy) * in_camera[:, 2]
-    z = in_camera[:, 2]
-    front = (z > 0) & (u > 0) & (v > 0) & (u < canvas.width * z) & (v < canvas.height * z)
-    ids, points = ids[front], points[front]
-    centers = inverse(sparse_map.T_cam_world)[:, :3, 3]
-    then = points - centers[sparse_map.keyframe_of(sparse_map.last_observation[ids])]
-    now = points - inverse(T_cam_world)[:3, 3]
-    distance_then, distance_now = np.linalg.norm(then, axis=1), np.linalg.norm(now, axis=1)
-    similar = (then * now).sum(axis=1) > np.cos(np.radians(config.max_view_angle_deg)) * distance_then * distance_now
-    ratio = distance_now / np.maximum(distance_then, 1e-12)
-    return np.asarray(ids[similar & (ratio < config.max_distance_ratio) & (ratio > 1.0 / config.max_distance_ratio)])
+    size, canvas = len(sparse_map.points_world), camera.canvas()
+    view = camera.fx, camera.fy, canvas.cx, canvas.cy, canvas.width, canvas.height
+    is_live, ids = np.zeros(size, np.bool_), np.empty(size, np.int64)
+    is_live[live_ids[live_ids < size]] = True
+    count = _list_candidates(
+        sparse_map.points_world, sparse_map.num_observations, sparse_map.last_observation, is_live, np.array(sparse_map.keyframe_starts),
+        sparse_map.T_cam_world, np.ascontiguousarray(T_cam_world), view,
+        config.min_observations, np.cos(np.radians(config.max_view_angle_deg)), config.max_distance_ratio, ids,
+    )  # fmt: skip
+    return ids[:count]
 
 
 def recover_landmarks(
@@ -132,18 +155,23 @@ def _take_up(tracks: Tracks, is_mapped: Array, ids: Array, pixels: Array, kappa:
     seen = is_mapped & (tracks.missed == 0)
     _, new, live = np.intersect1d(place, live_place[seen], return_indices=True)
     meetings = np.stack([ids[new], tracks.ids[seen][live]], axis=1)
-    free = ~np.isin(place, live_place[is_mapped])
+    free = ~np.isin(place, live_place[is_mapped], kind="table")
     ids, pixels, place = ids[free], pixels[free], place[free]
     _, first = np.unique(place, return_index=True)
     ids, pixels, place = ids[first], pixels[first], place[first]
-    remaining = tracks.select(~np.isin(live_place, place))
+    remaining = tracks.select(~np.isin(live_place, place, kind="table"))
     at = np.rint(pixels).astype(np.int64)
     ages, missed = np.zeros(len(ids), np.int32), np.zeros(len(ids), np.int32)
     return Tracks.concatenate(remaining, Tracks(ids, pixels, kappa[at[:, 1], at[:, 0]], ages, missed)), meetings
 
 
 def same_landmarks(meetings: Array, tracks: Tracks, sparse_map: SparseMap, T_cam_world: Array, max_distance: float) -> Array:
-    """Of landmarks that met tracked ones (N, 2) the pairs (M, 2) that are one: near each other in space, relative to their depth."""
+    """Of landmarks that met tracked ones (N, 2) the pairs (M, 2) that are one: near each other in space, relative to their depth.
+
+    With a largest distance of 0 there are none.
+    """
+    if max_distance == 0.0:
+        return np.zeros((0, 2), np.int64)
     usable = sparse_map.is_mapped(meetings[:, 0]) & sparse_map.is_mapped(meetings[:, 1])
     usable &= np.isin(meetings[:, 1], tracks.ids) & ~np.isin(meetings[:, 0], tracks.ids)
     pairs = meetings[usable]

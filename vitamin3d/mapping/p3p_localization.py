@@ -11,6 +11,9 @@ from vitamin3d.geometry.reprojection import linearize, reprojection_errors, retr
 from vitamin3d.geometry.robust import geman_mcclure_cost, geman_mcclure_weight
 from vitamin3d.types import Array, Localization
 
+ROUGH_GAIN = 1e-2
+"""A pose that only has to tell inliers from outliers is refined until a step gains less than this share of the cost."""
+
 
 @kernel
 def _normal_equations(intrinsics, R, t, points, pixels, squared_sigma, H, g):  # type: ignore[no-untyped-def]
@@ -40,7 +43,7 @@ def _cost(intrinsics, R, t, points, pixels, squared_sigma):  # type: ignore[no-u
 
 
 @kernel
-def _refine(intrinsics, R, t, points, pixels, squared_sigma, iterations):  # type: ignore[no-untyped-def]
+def _refine(intrinsics, R, t, points, pixels, squared_sigma, iterations, relative_gain):  # type: ignore[no-untyped-def]
     """Levenberg–Marquardt in place on R (3, 3), t (3,); the cost never rises. NaN input moves nothing."""
     H, g, R_new, t_new = np.empty((6, 6)), np.empty(6), np.empty((3, 3)), np.empty(3)
     damping, cost = 1e-6, _cost(intrinsics, R, t, points, pixels, squared_sigma)
@@ -56,7 +59,7 @@ def _refine(intrinsics, R, t, points, pixels, squared_sigma, iterations):  # typ
         if new_cost <= cost:
             R[:, :], t[:] = R_new, t_new
             gain, cost, damping = cost - new_cost, new_cost, max(1e-9, 0.1 * damping)
-            if gain <= 1e-6 * cost:
+            if gain <= relative_gain * cost:
                 break
         else:
             damping = max(1e-4, 10.0 * damping)
@@ -64,11 +67,18 @@ def _refine(intrinsics, R, t, points, pixels, squared_sigma, iterations):  # typ
                 break
 
 
-def refine_pose(T_cam_world: Array, points_world: Array, pixels: Array, camera: Camera, sigma_px: float, iterations: int) -> Array:
-    """T_cam_world (4, 4) that minimises the Geman–McClure cost of the reprojection errors, from a first guess."""
+def refine_pose(
+    T_cam_world: Array, points_world: Array, pixels: Array, camera: Camera, sigma_px: float, iterations: int, relative_gain: float = 1e-6
+) -> Array:
+    """T_cam_world (4, 4) that minimises the Geman–McClure cost of the reprojection errors, from a first guess.
+
+    It ends when a step gains less than relative_gain of the cost.
+    """
     refined = np.array(T_cam_world)
     R, t = np.ascontiguousarray(refined[:3, :3]), np.ascontiguousarray(refined[:3, 3])
-    _refine(camera.intrinsics, R, t, np.ascontiguousarray(points_world), np.ascontiguousarray(pixels), sigma_px**2, iterations)
+    _refine(
+        camera.intrinsics, R, t, np.ascontiguousarray(points_world), np.ascontiguousarray(pixels), sigma_px**2, iterations, relative_gain
+    )
     U, _, Vt = np.linalg.svd(R)
     refined[:3, :3], refined[:3, 3] = U @ Vt, t
     return refined
@@ -82,7 +92,7 @@ def _best_start(T_prior: Array | None, points: Array, pixels: Array, camera: Cam
     """The prior (refined) if it explains enough, else the better one of it and of P3P RANSAC."""
     n, starts = len(points), []
     if T_prior is not None:
-        starts.append(refine_pose(T_prior, points, pixels, camera, 2.0 * config.sigma_px, config.iterations))
+        starts.append(refine_pose(T_prior, points, pixels, camera, 2.0 * config.sigma_px, config.iterations, ROUGH_GAIN))
         if _inliers(starts[0], points, pixels, camera, config.outlier_px).mean() >= config.prior_inlier_ratio:
             return starts[0]
     sample = np.random.default_rng(seed).permutation(n)[: config.ransac_points]

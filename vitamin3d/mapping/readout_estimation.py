@@ -50,13 +50,19 @@ def estimate_readout(sparse_map: SparseMap, camera: Camera, config: CalibrationC
     found = ReadoutEstimate(camera.readout_s, np.inf)
     if step <= 0 or not sparse_map.image_motions.any():
         return found
-    blocks = [_block(sparse_map, first, camera, config) for first in range(0, sparse_map.num_keyframes, BLOCK_KEYFRAMES)]
+    blocks = [_block(sparse_map, int(first), camera, config) for first in _block_starts(sparse_map.num_keyframes, config.readout_blocks)]
     for _ in range(SEARCHES):
         offset, deviation = _parabola([block.costs_around(found.readout_s, step, config.sigma_px) for block in blocks])
         found = ReadoutEstimate(found.readout_s + step * float(np.clip(offset, -FARTHEST_STEPS, FARTHEST_STEPS)), step * deviation)
         if abs(offset) <= 0.5:
             return found
     return ReadoutEstimate(found.readout_s, np.inf)
+
+
+def _block_starts(num_keyframes: int, most: int) -> Array:
+    """First keyframes of at most so many blocks, spread evenly."""
+    starts = np.arange(0, num_keyframes, BLOCK_KEYFRAMES)
+    return np.asarray(starts[np.linspace(0, len(starts) - 1, min(most, len(starts))).astype(int)])
 
 
 def _parabola(blocks: list[tuple[Array, BundleReport]]) -> tuple[float, float]:

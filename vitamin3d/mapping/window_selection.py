@@ -34,7 +34,10 @@ def _count_shared(starts, num_keyframes, obs_landmark, obs_valid, first, marked,
 
 @kernel
 def _gather(keyframes, num_window, starts, obs_landmark, obs_valid, first, points, local, ids, obs_rows, obs_cam, obs_point):  # type: ignore[no-untyped-def]
-    """Numbers the window's landmarks and lists their observations; returns both counts. `local` comes as -1."""
+    """Numbers the window's landmarks and lists their observations; returns both counts.
+
+    `local` comes as -1, and -2 for landmarks that do not take part.
+    """
     num_points, num_obs = 0, 0
     for c in range(keyframes.shape[0]):
         k = keyframes[c]
@@ -43,7 +46,7 @@ def _gather(keyframes, num_window, starts, obs_landmark, obs_valid, first, point
             if not obs_valid[i] or i < first[id_] or np.isnan(points[id_, 0]):
                 continue
             if local[id_] < 0:
-                if c >= num_window:
+                if c >= num_window or local[id_] < -1:
                     continue
                 local[id_] = num_points
                 ids[num_points] = id_
@@ -87,6 +90,21 @@ def whole_map(sparse_map: SparseMap) -> Window:
     return Window(np.arange(sparse_map.num_keyframes), sparse_map.num_keyframes, 1)
 
 
+def spread_over_map(sparse_map: SparseMap, most: int) -> Window:
+    """At most so many keyframes, spread evenly, the first held fixed."""
+    count = sparse_map.num_keyframes
+    keyframes = np.linspace(0, count - 1, min(most, count)).astype(np.int64)
+    return Window(keyframes, len(keyframes), 1)
+
+
+def most_observed(sparse_map: SparseMap, ids: Array, most: int) -> Array:
+    """Indices into track ids (N,) of those that are landmarks, at most so many (0: all), those with the most observations."""
+    mapped = np.flatnonzero(sparse_map.is_mapped(ids))
+    if not 0 < most < len(mapped):
+        return mapped
+    return np.asarray(mapped[np.argsort(-sparse_map.num_observations[ids[mapped]], kind="stable")[:most]])
+
+
 def _anchors(sparse_map: SparseMap, oldest: int, config: WindowConfig) -> Array:
     starts = np.array(sparse_map.keyframe_starts)
     marked = np.zeros(len(sparse_map.points_world), np.bool_)
@@ -98,15 +116,20 @@ def _anchors(sparse_map: SparseMap, oldest: int, config: WindowConfig) -> Array:
     return np.sort(best[shared[best] >= config.min_shared_landmarks])
 
 
-def build_problem(sparse_map: SparseMap, window: Window, view: tuple[Array, Array, Array] | None = None) -> BundleProblem:
+def build_problem(
+    sparse_map: SparseMap, window: Window, view: tuple[Array, Array, Array] | None = None, only_in_view: bool = False
+) -> BundleProblem:
     """The adjustment of a window, with the newest frame where it is no keyframe.
 
     Args:
         view: T_cam_world (4, 4), landmark ids (N,) and ideal pixels (N, 2) of that frame, or None.
+        only_in_view: whether other landmarks than its are left out.
     """
     starts = np.array(sparse_map.keyframe_starts)
     size = int((starts[window.keyframes + 1] - starts[window.keyframes]).sum())
-    local = np.full(len(sparse_map.points_world), -1, np.int32)
+    local = np.full(len(sparse_map.points_world), -2 if only_in_view else -1, np.int32)
+    if view is not None:
+        local[view[1]] = -1
     ids, rows = np.empty(size, np.int64), np.empty(size, np.int64)
     obs_camera, obs_point = np.empty(size, np.int32), np.empty(size, np.int32)
     num_points, num_obs = _gather(
