@@ -8,7 +8,8 @@
 The steps run one after the other on one thread and are timed by that thread's CPU, so that other load on the machine
 matters little; the processor's caches it still shares. The sparse half runs first (its scale from the ground truth, where
 there is one: the paper's voxels are 15 and 2.5 cm), then the dense half over its keyframes. In every frame KLT tracks as
-many points as are alive, forward only; at every tenth keyframe the window is also solved by the Schur complement alone.
+many points as are alive, forward only; at every tenth keyframe the window is also solved by the Schur complement alone. The
+volumes' time is that of fusing one view and extracting the whole surface: the median over ten times in the course of the run.
 """
 
 import argparse
@@ -39,6 +40,7 @@ from vitamin3d.errors import InputError, Vitamin3dError
 from vitamin3d.exporters.files import write_file
 from vitamin3d.exporters.line_plot import Axes, Line, line_plot
 from vitamin3d.job import with_voxels
+from vitamin3d.mapping.landmark_statistics import information_by_id
 from vitamin3d.mapping.window_adjustment import WindowAdjustment
 from vitamin3d.mapping.window_selection import Window
 from vitamin3d.reconstruction import Reconstruction
@@ -51,6 +53,8 @@ from vitamin3d.warmup import warm_up
 
 SCHUR_INTERVAL = 10
 MEMORY_INTERVAL = 250
+EXTRACTIONS = 10
+"""The surfaces are extracted so often in the course of a run."""
 KLT, SCHUR, DECODING = "OpenCV KLT, as many points", "Schur complement, same window", "decoding"
 
 
@@ -141,15 +145,26 @@ def run_dense(dataset: Dataset, made: Measured, config: Config, scale: Scale) ->
     reconstruction = Reconstruction(made.slam.camera, with_voxels(config, scale))
     reconstruction.times.clock = time.thread_time
     begun = time.thread_time()
+    by_id, count = information_by_id(made.slam.map, made.slam.camera), made.slam.map.num_keyframes
+    extra_seconds = 0.0
     for keyframe, index in enumerate(made.slam.map.frame_indices):
         frame = dataset.read(index)
         if not isinstance(frame, Unreadable):
             with reconstruction.times.timed("snapshot"):
-                snapshot = made.slam.snapshot(keyframe, frame)
+                snapshot = made.slam.snapshot(keyframe, frame, by_id)
             reconstruction.add_keyframe(snapshot)
+        if keyframe % (1 + count // EXTRACTIONS) == count // EXTRACTIONS and reconstruction.low is not None:
+            extra_seconds += extraction_seconds(reconstruction)
     reconstruction.surfaces()
-    made.dense_seconds = time.thread_time() - begun
+    made.dense_seconds = time.thread_time() - begun - extra_seconds
     return reconstruction
+
+
+def extraction_seconds(reconstruction: Reconstruction) -> float:
+    """Extracts both surfaces as they are by now, timed as steps; what it took."""
+    begun = time.thread_time()
+    reconstruction.surfaces_so_far()
+    return time.thread_time() - begun
 
 
 def benchmark(dataset: Dataset, frames: int | None, config: Config) -> dict[str, Any]:
@@ -198,8 +213,10 @@ def rows(made: Measured, reconstruction: Reconstruction) -> dict[str, dict[str, 
         summed = np.zeros(length)
         for one in per_item:  # shorter ones started later (after the initialisation), or run in some frames only
             summed[length - len(one) :] += one
-        summed += sum(float(e[-1]) for e in extraction)
+        summed += sum(float(np.median(e)) for e in extraction)
         found[row] = {"median_ms": float(np.median(summed)), "p95_ms": float(np.percentile(summed, 95))} if length else {}
+        if length and extraction:
+            found[row]["at_the_end_ms"] = found[row]["median_ms"] + sum(float(e[-1] - np.median(e)) for e in extraction)
     return found
 
 
@@ -284,7 +301,8 @@ def table(figures: dict[str, Any]) -> str:
     lines += [f"Table 2: tracking {tracking.get('median_ms', np.nan):.1f} ms per frame ({others})", "Table 3"]
     for row, ms in TABLE_3_MS.items():
         ours = figures["rows"].get(row, {})
-        lines.append(f"  {row:42}{ours.get('median_ms', np.nan):9.2f}{ours.get('p95_ms', np.nan):9.2f}{ms:9.0f}")
+        at_the_end = f"   at the end {ours['at_the_end_ms']:.0f}" if "at_the_end_ms" in ours else ""
+        lines.append(f"  {row:42}{ours.get('median_ms', np.nan):9.2f}{ours.get('p95_ms', np.nan):9.2f}{ms:9.0f}{at_the_end}")
     lines.append("Steps")
     lines += [f"  {name:42}{s['median_ms']:9.2f}{s['p95_ms']:9.2f}{s['count']:9}×" for name, s in figures["steps"].items()]
     sparse, dense = figures["sparse_cpu_seconds"], figures["dense_cpu_seconds"]

@@ -579,7 +579,7 @@ def paper_config() -> Config:
 
 
 def live_config(base: Config) -> Config:
-    """`base` for cameras that do not wait: fewer keyframes, smaller windows, and meshes made soon after their pictures.
+    """`base` for cameras that do not wait: fewer keyframes, and meshes made soon after their pictures.
 
     Nothing is adjusted again at the end: the mesh is there already. The volume is ours, since Open3D's lets no other thread run
     while it integrates a view.
@@ -589,8 +589,8 @@ def live_config(base: Config) -> Config:
         base,
         extrema=change(base.extrema, max_tracks=min(5600, base.extrema.max_tracks)),
         keyframes=change(base.keyframes, motion_px=20.0),
-        window=change(base.window, keyframes=10, anchors=min(20, base.window.anchors), settled_keyframes=2, settled_frames=10),
-        bundle_adjustment=change(base.bundle_adjustment, keyframe_interval=1, keyframe_iterations=3, sweeps_per_frame=0),
+        window=change(base.window, settled_keyframes=2, settled_frames=10),
+        bundle_adjustment=change(base.bundle_adjustment, sweeps_per_frame=0),
         final_adjustment=change(base.final_adjustment, enabled=False),
         calibration=change(base.calibration, refine="off"),
         memory=change(base.memory, max_keyframes=600, max_new_tracks=60_000),

@@ -14,7 +14,7 @@ from vitamin3d.datasets.pictures import Unreadable
 from vitamin3d.errors import InputError
 from vitamin3d.exporters.output_folder import OutputFolder
 from vitamin3d.geometry.se3 import inverse
-from vitamin3d.mapping.landmark_statistics import point_cloud
+from vitamin3d.mapping.landmark_statistics import information_by_id, point_cloud
 from vitamin3d.reconstruction import Reconstruction
 from vitamin3d.run_report import write_report
 from vitamin3d.run_statistics import Stopwatch, live_table, run_statistics
@@ -132,10 +132,11 @@ class _JobRun:
 
     def _snapshots(self) -> Iterator[MapSnapshot]:
         """The keyframes of the finished map, their pictures read again."""
+        by_id = information_by_id(self.slam.map, self.slam.camera)
         for keyframe, frame_index in enumerate(self.slam.map.frame_indices):
             frame = self.dataset.read(frame_index)
             if not isinstance(frame, Unreadable):
-                yield self.slam.snapshot(keyframe, frame)
+                yield self.slam.snapshot(keyframe, frame, by_id)
 
     def _keyframe_done(self, view: DepthView) -> None:
         keyframes = self.slam.map.timestamps_ns

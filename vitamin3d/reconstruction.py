@@ -186,6 +186,10 @@ class Reconstruction:
         """The coarse and the fine surface of all keyframes so far, those that still waited for neighbours included."""
         self.finish()
         self._fuse_waiting()
+        return self.surfaces_so_far()
+
+    def surfaces_so_far(self) -> tuple[Surface, Surface]:
+        """The coarse and the fine surface of the keyframes that are fused; empty while the voxels are not chosen yet."""
         with self.times.timed("surface_low"):
             low = self._surface(self.low)
         with self.times.timed("surface_high"):

@@ -20,7 +20,7 @@ from vitamin3d.mapping.calibration_refinement import CalibrationRefinement
 from vitamin3d.mapping.initialization_history import InitializationHistory, TrackedView
 from vitamin3d.mapping.keyframe_selection import is_keyframe
 from vitamin3d.mapping.landmark_recovery import cut_patches, patch_similarity, recover_landmarks, same_landmarks
-from vitamin3d.mapping.landmark_statistics import keyframe_vertices
+from vitamin3d.mapping.landmark_statistics import UnitInformation, keyframe_vertices
 from vitamin3d.mapping.landmark_triangulation import triangulate_landmarks
 from vitamin3d.mapping.map_condensation import condense, is_due
 from vitamin3d.mapping.map_initialization import add_view, build_first_map
@@ -410,11 +410,15 @@ class Slam:
         ready = sorted(k for k, frame in self._pending_frames.items() if k < settled or frame.index <= rests_since)
         return [(k, self._pending_frames.pop(k)) for k in ready]
 
-    def snapshot(self, keyframe: int, frame: Frame) -> MapSnapshot:
-        """A keyframe with the depths of its landmarks as the map has them now; its picture as if read at one moment."""
-        vertices = keyframe_vertices(self.map, keyframe, self.camera, self.config.snapshot)
+    def snapshot(self, keyframe: int, frame: Frame, by_id: UnitInformation | None = None) -> MapSnapshot:
+        """A keyframe with the depths of its landmarks as the map has them now; its picture as if read at one moment.
+
+        `by_id` is the map's `information_by_id`, for many keyframes of a map that is finished.
+        """
+        at = self.map, keyframe, self.camera, self.config.snapshot, by_id
+        vertices = keyframe_vertices(*at)
         if self.config.snapshot.unobserved:
-            vertices = with_unobserved(vertices, self.map, keyframe, self.camera, self.config.snapshot)
+            vertices = with_unobserved(vertices, *at)
         motion = self.map.image_motions[keyframe]
         return MapSnapshot(at_one_moment(frame, motion, self.camera), self.map.clone_pose(keyframe), *vertices)
 

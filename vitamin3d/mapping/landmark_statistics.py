@@ -120,8 +120,23 @@ def observation_variances(squared: Array, count: Array, config: SnapshotConfig) 
     return np.asarray(noise * (1.0 + config.shared_error * count))
 
 
-def unit_information(sparse_map: SparseMap, ids: Array, camera: Camera) -> tuple[Array, Array, Array]:
-    """Sums of JᵀJ (N, 3, 3) per landmark, in the world, for a pixel of noise; sums (N,) of its squared errors; counts (N,)."""
+class UnitInformation(NamedTuple):
+    """What observations say about N landmarks, for a pixel of noise."""
+
+    information: Array
+    """(N, 3, 3) sums of JᵀJ, in the world."""
+    squared: Array
+    """(N,) sums of squared reprojection errors, pixels²."""
+    counts: Array
+    """(N,) observations."""
+
+    def of(self, chosen: Array) -> "UnitInformation":
+        """That of some landmarks, by their numbers (M,) among these."""
+        return UnitInformation(self.information[chosen], self.squared[chosen], self.counts[chosen])
+
+
+def unit_information(sparse_map: SparseMap, ids: Array, camera: Camera) -> UnitInformation:
+    """What the observations in keyframes say about landmarks (N,) ids; one pass over all observations of the map."""
     wanted = np.full(len(sparse_map.points_world), -1, np.int64)
     wanted[ids] = np.arange(len(ids))
     poses, H, squared, count = sparse_map.T_cam_world, np.zeros((len(ids), 3, 3)), np.zeros(len(ids)), np.zeros(len(ids), np.int64)
@@ -131,7 +146,12 @@ def unit_information(sparse_map: SparseMap, ids: Array, camera: Camera) -> tuple
         sparse_map.obs_pixels, sparse_map.first_observation, sparse_map.points_world, wanted, H,
         squared, count,
     )  # fmt: skip
-    return H, squared, count
+    return UnitInformation(H, squared, count)
+
+
+def information_by_id(sparse_map: SparseMap, camera: Camera) -> UnitInformation:
+    """That of all landmarks, by id (L,): for a map that changes no more, so that each keyframe need not look for its own."""
+    return unit_information(sparse_map, np.arange(len(sparse_map.points_world)), camera)
 
 
 def relative_depth_deviations(information: Array, points_world: Array, T_cam_world: Array) -> Array:
@@ -163,19 +183,27 @@ class Vertices(NamedTuple):
     """(N,)."""
 
 
-def keyframe_vertices(sparse_map: SparseMap, keyframe: int, camera: Camera, config: SnapshotConfig) -> Vertices:
-    """The landmarks observed in a keyframe."""
+def keyframe_vertices(
+    sparse_map: SparseMap, keyframe: int, camera: Camera, config: SnapshotConfig, by_id: UnitInformation | None = None
+) -> Vertices:
+    """The landmarks observed in a keyframe; `by_id` as for `vertices_of`."""
     rows = sparse_map.observations_of(keyframe)
     ids = sparse_map.obs_landmark[rows]
-    return vertices_of(sparse_map, ids[sparse_map.obs_valid[rows] & sparse_map.is_mapped(ids)], keyframe, camera, config)
+    return vertices_of(sparse_map, ids[sparse_map.obs_valid[rows] & sparse_map.is_mapped(ids)], keyframe, camera, config, by_id)
 
 
-def vertices_of(sparse_map: SparseMap, ids: Array, keyframe: int, camera: Camera, config: SnapshotConfig) -> Vertices:
-    """Of landmarks (N,) ids, those in front of a keyframe's camera whose depth is known well enough."""
+def vertices_of(
+    sparse_map: SparseMap, ids: Array, keyframe: int, camera: Camera, config: SnapshotConfig, by_id: UnitInformation | None = None
+) -> Vertices:
+    """Of landmarks (N,) ids, those in front of a keyframe's camera whose depth is known well enough.
+
+    Args:
+        by_id: `information_by_id` of the map as it is, where there is one.
+    """
     ids = ids[sparse_map.num_observations[ids] >= config.min_observations]
     points, T = sparse_map.points_world[ids], sparse_map.T_cam_world[keyframe]
     in_camera = points @ T[:3, :3].T + T[:3, 3]
-    information, squared, count = unit_information(sparse_map, ids, camera)
+    information, squared, count = unit_information(sparse_map, ids, camera) if by_id is None else by_id.of(ids)
     variances, rms = observation_variances(squared, count, config), np.sqrt(squared / np.maximum(count, 1))
     deviations = relative_depth_deviations(information / variances[:, None, None], points, T)
     usable = (in_camera[:, 2] > 0) & (deviations < config.max_relative_deviation) & (rms < config.max_reprojection_rms_px)

@@ -10,14 +10,19 @@ from scipy.spatial import cKDTree
 
 from vitamin3d.config import SnapshotConfig
 from vitamin3d.geometry.camera import Camera
-from vitamin3d.mapping.landmark_statistics import Vertices, vertices_of
+from vitamin3d.mapping.landmark_statistics import UnitInformation, Vertices, vertices_of
 from vitamin3d.mapping.sparse_map import SparseMap
 from vitamin3d.types import Array
 
 
-def with_unobserved(observed: Vertices, sparse_map: SparseMap, keyframe: int, camera: Camera, config: SnapshotConfig) -> Vertices:
-    """The vertices of a keyframe and, behind them, the landmarks that it sees without having observed them."""
-    found = vertices_of(sparse_map, _in_the_picture(sparse_map, keyframe, camera), keyframe, camera, config)
+def with_unobserved(
+    observed: Vertices, sparse_map: SparseMap, keyframe: int, camera: Camera, config: SnapshotConfig, by_id: UnitInformation | None = None
+) -> Vertices:
+    """The vertices of a keyframe and, behind them, the landmarks that it sees without having observed them.
+
+    `by_id` is as for `vertices_of`.
+    """
+    found = vertices_of(sparse_map, _in_the_picture(sparse_map, keyframe, camera), keyframe, camera, config, by_id)
     if len(observed.depths) < config.occlusion_neighbours or len(found.depths) == 0:
         return observed
     visible = is_visible(found, observed, config)
