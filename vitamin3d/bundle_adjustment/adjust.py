@@ -19,8 +19,8 @@ from vitamin3d.bundle_adjustment.problem import BundleProblem, points_of_long_tr
 from vitamin3d.bundle_adjustment.rejection import Rejection, reject
 from vitamin3d.bundle_adjustment.schur import ReducedSystem, adjust_accelerated, adjust_schur, minimise
 from vitamin3d.bundle_adjustment.self_calibration import parameter_basis
-from vitamin3d.bundle_adjustment.subspace import adjust_by_inner_sweeps, adjust_subspace, step_until, sweep_until
-from vitamin3d.bundle_adjustment.variables import Progress, Variables, free_slots, sightings_of
+from vitamin3d.bundle_adjustment.subspace import adjust_by_inner_sweeps, adjust_subspace, step_until, sweep_points, sweep_until
+from vitamin3d.bundle_adjustment.variables import Progress, Variables, free_slots, pinhole_model, sightings_of
 from vitamin3d.config import BundleAdjustmentConfig
 from vitamin3d.errors import InputError
 from vitamin3d.geometry.camera import Camera
@@ -34,7 +34,7 @@ SOLVERS: dict[str, Callable[[BundleProblem, Camera, float, int, float], tuple[Bu
 }
 """The tracker's way in: problem in ideal pixels, camera, sigma_px, the most iterations, the relative gain that ends them."""
 
-POINT_SWEEPS = 2
+POINT_SWEEPS = 1
 """Over the points that were not adjusted together with the cameras."""
 
 
@@ -188,6 +188,8 @@ def adjust_by_long_tracks(
     part, report = solve(select_points(problem, chosen))
     points = np.array(problem.points_world)
     points[chosen] = part.points_world
-    held = np.zeros(len(problem.T_cam_world), np.bool_)
-    placed = dataclasses.replace(problem, T_cam_world=part.T_cam_world, points_world=points, camera_is_free=held)
-    return dataclasses.replace(adjust_subspace(placed, camera, sigma_px, POINT_SWEEPS)[0], camera_is_free=problem.camera_is_free), report
+    placed = dataclasses.replace(problem, T_cam_world=part.T_cam_world, points_world=points)
+    variables, sightings = Variables.of(placed, pinhole_model(camera)), sightings_of(problem)
+    for _ in range(POINT_SWEEPS):
+        sweep_points(variables.views(free_slots(problem)), sightings, variables.points, 1.0 / sigma_px**2)
+    return dataclasses.replace(placed, points_world=variables.points), report
