@@ -217,7 +217,7 @@ class BundleAdjustmentConfig:
 
     sigma_px: float = 2.0
     sweeps_per_frame: int = 2
-    """Subspace Gauss–Newton sweeps over the window at every frame (Eq. 11–12)."""
+    """Subspace Gauss–Newton sweeps over the newest keyframes and the frame's landmarks, at every frame (Eq. 11–12)."""
     keyframe_solver: str = "subspace-accelerated"
     """Solver of the window at each keyframe: `subspace-accelerated` (cameras together with the points eliminated, then each
     point alone), `schur` (the former only), `subspace` (Eq. 11–12) or `subspace-inner` (several sweeps with the same derivatives)."""
@@ -233,8 +233,6 @@ class BundleAdjustmentConfig:
     """Keyframes that are adjusted with every frame;"""
     frame_anchors: int = 36
     """so many before them are their anchors."""
-    frame_points: int = 1000
-    """About so many of the frame's landmarks take part, those with the most observations; 0: all landmarks that the keyframes see."""
     outlier_px: float = 5.0
 
 

@@ -36,7 +36,6 @@ from vitamin3d.mapping.window_prior import WindowPrior
 from vitamin3d.mapping.window_selection import (
     Window,
     build_problem,
-    most_observed,
     select_frame_window,
     select_window,
     store_solution,
@@ -373,9 +372,9 @@ class Slam:
             return T_cam_world
         with self.times.timed("bundle_adjustment_frame"):
             seen, pixels = self._seen()
-            used = most_observed(self.map, seen.ids, adjustment.frame_points)
+            mapped = self.map.is_mapped(seen.ids)
             window = select_frame_window(self.map, adjustment.frame_keyframes, adjustment.frame_anchors)
-            problem = build_problem(self.map, window, (T_cam_world, seen.ids[used], pixels[used]), adjustment.frame_points > 0)
+            problem = build_problem(self.map, window, (T_cam_world, seen.ids[mapped], pixels[mapped]))
             solved, _ = adjust_subspace(problem, self.camera, adjustment.sigma_px, adjustment.sweeps_per_frame)
             store_solution(self.map, window, solved)
         return np.asarray(solved.T_cam_world[-1])

@@ -97,14 +97,6 @@ def spread_over_map(sparse_map: SparseMap, most: int) -> Window:
     return Window(keyframes, len(keyframes), 1)
 
 
-def most_observed(sparse_map: SparseMap, ids: Array, most: int) -> Array:
-    """Indices into track ids (N,) of those that are landmarks, at most so many (0: all), those with the most observations."""
-    mapped = np.flatnonzero(sparse_map.is_mapped(ids))
-    if not 0 < most < len(mapped):
-        return mapped
-    return np.asarray(mapped[np.argsort(-sparse_map.num_observations[ids[mapped]], kind="stable")[:most]])
-
-
 def _anchors(sparse_map: SparseMap, oldest: int, config: WindowConfig) -> Array:
     starts = np.array(sparse_map.keyframe_starts)
     marked = np.zeros(len(sparse_map.points_world), np.bool_)
@@ -116,18 +108,16 @@ def _anchors(sparse_map: SparseMap, oldest: int, config: WindowConfig) -> Array:
     return np.sort(best[shared[best] >= config.min_shared_landmarks])
 
 
-def build_problem(
-    sparse_map: SparseMap, window: Window, view: tuple[Array, Array, Array] | None = None, only_in_view: bool = False
-) -> BundleProblem:
-    """The adjustment of a window, with the newest frame where it is no keyframe.
+def build_problem(sparse_map: SparseMap, window: Window, view: tuple[Array, Array, Array] | None = None) -> BundleProblem:
+    """The adjustment of a window, or of the newest frame, where it is no keyframe, and its landmarks.
 
     Args:
         view: T_cam_world (4, 4), landmark ids (N,) and ideal pixels (N, 2) of that frame, or None.
-        only_in_view: whether other landmarks than its are left out.
+            Landmarks that it does not see are left out.
     """
     starts = np.array(sparse_map.keyframe_starts)
     size = int((starts[window.keyframes + 1] - starts[window.keyframes]).sum())
-    local = np.full(len(sparse_map.points_world), -2 if only_in_view else -1, np.int32)
+    local = np.full(len(sparse_map.points_world), -1 if view is None else -2, np.int32)
     if view is not None:
         local[view[1]] = -1
     ids, rows = np.empty(size, np.int64), np.empty(size, np.int64)
