@@ -86,7 +86,7 @@ def live_table(record: RunRecord, mesh_lags: list[float]) -> dict[str, Any]:
     table: dict[str, Any] = {
         "keyframes_offered": record.keyframes_offered,
         "keyframes_dropped": record.keyframes_dropped,
-        "adjustments_skipped": record.adjustments_skipped,
+        "adjustments_awaited": record.adjustments_awaited,
     }
     if record.latencies:
         milliseconds = np.array([1e3 * seconds for _, seconds in record.latencies])

@@ -82,8 +82,8 @@ class RunRecord:
     """To the dense half."""
     keyframes_dropped: int = 0
     """Which the dense half had no time for (live runs)."""
-    adjustments_skipped: int = 0
-    """Keyframes that came while the window before was still being adjusted (live runs)."""
+    adjustments_awaited: int = 0
+    """Keyframes that waited for the adjustment of the window before (runs with a clock)."""
     latencies: list[tuple[int, float]] | None = None
     """Frame index, and seconds from when its picture was due until it was done; where there is a clock."""
 
@@ -185,13 +185,14 @@ def run_live(
     record: RunRecord | None = None,
     clock: Clock | None = None,
 ) -> RunRecord:
-    """As `run_threaded`, but the camera waits for nothing: windows are adjusted beside it, and meshing drops what it has no time for.
+    """As `run_threaded`, but the camera does not wait for meshes: what there is no time for is dropped.
 
     Args:
         consume: iterates over the keyframes that are to be meshed, on a thread of its own.
-        clock: pictures come when their time stamps say; None: as fast as they are tracked.
+        clock: pictures come when their time stamps say, and windows are adjusted beside the tracking; None: pictures come as fast as
+            they are tracked.
 
-    Which windows are adjusted and which keyframes are meshed depends on how busy the machine is: runs differ.
+    Which keyframes are meshed, and with a clock when a window's adjustment reaches the map, depends on how busy the machine is.
     """
     record = _begin(indices, record)
     record.latencies = [] if clock is not None else None
@@ -200,9 +201,10 @@ def run_live(
         gc.freeze()  # what is there now is not looked through again while pictures come
         threads.callback(gc.unfreeze)
         dense = threads.enter_context(Consumer(consume, "dense", LIVE_SNAPSHOTS_AHEAD, DENSE_NICENESS)) if consume else None
-        adjuster: Errand[WindowAdjustment] = Errand("adjustment", ADJUSTMENT_NICENESS)
-        slam.adjuster = threads.enter_context(adjuster)
-        threads.callback(setattr, slam, "adjuster", AdjustAtOnce())
+        if clock is not None:
+            adjuster: Errand[WindowAdjustment] = Errand("adjustment", ADJUSTMENT_NICENESS)
+            slam.adjuster = threads.enter_context(adjuster)
+            threads.callback(setattr, slam, "adjuster", AdjustAtOnce())
         fronts = threads.enter_context(_fronts_ahead(threads, _pictures(dataset, indices), front_end, clock))
         if clock is not None:
             threads.callback(clock.cancel)
@@ -210,7 +212,7 @@ def run_live(
         if dense is not None:
             run.tell_time = _tell_while_waiting(dense)
         run.all_frames(fronts)
-        record.adjustments_skipped = slam.adjustments_skipped
+        record.adjustments_awaited = slam.adjustments_awaited
         return record
 
 

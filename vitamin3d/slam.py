@@ -64,7 +64,7 @@ class Slam:
         self.initialization_reason, self.initialization_retries = "no frame was read", 0
         self.calibration = CalibrationRefinement(camera, config.calibration)
         self.adjuster: Adjuster = AdjustAtOnce()
-        self.adjustments_skipped = 0
+        self.adjustments_awaited = 0
         self._past = WindowPrior(config)
         self._history = InitializationHistory(config.initialization)
         self._pending_frames: dict[int, Frame] = {}
@@ -260,6 +260,7 @@ class Slam:
     def _map(self, front: FrontEndFrame, T_cam_world: Array) -> None:
         """Keyframes, landmarks, and bundle adjustment on every frame (Eq. 11–12)."""
         if self._is_keyframe(front.frame):
+            T_cam_world = self._after_adjustment(T_cam_world)
             self._merge_landmarks(T_cam_world)
             keyframe = self._add_keyframe(front, T_cam_world)
             triangulate_landmarks(self.map, self.camera, self.config.triangulation)
@@ -297,10 +298,7 @@ class Slam:
             self.tracks = self.tracks.renamed(pairs[:, 1], pairs[:, 0])
 
     def _adjust_window(self) -> None:
-        """The keyframe's adjustment of the window and its landmarks, anchored; skipped while the one before is not done."""
-        if self.adjuster.is_busy:
-            self.adjustments_skipped += 1
-            return
+        """The keyframe's adjustment of the window and its landmarks, anchored."""
         if self.config.window.past == "prior":
             window, problem = self._past.advance(self.map, self.camera)
         else:
@@ -314,6 +312,15 @@ class Slam:
         """Runs on the adjuster's thread."""
         with self.times.timed("bundle_adjustment_keyframe"):
             return WindowAdjustment(window, adjust_bundle(problem, self.camera, self.config.bundle_adjustment, prior)[0])
+
+    def _after_adjustment(self, T_cam_world: Array) -> Array:
+        """A keyframe's T_cam_world in the map after the adjustment begun before it, which is waited for: else the map would drift."""
+        if not self.adjuster.is_busy:
+            return T_cam_world
+        self.adjustments_awaited += 1
+        T_cam_keyframe = T_cam_world @ inverse(self.map.T_cam_world[-1])
+        self.take_adjustment(wait=True)
+        return self._relocalize(T_cam_keyframe @ self.map.T_cam_world[-1])
 
     def take_adjustment(self, wait: bool = False) -> None:
         """The window that was adjusted meanwhile enters the map; its outliers leave the map and the tracks."""

@@ -222,23 +222,31 @@ def test_windows_are_adjusted_at_every_so_many_keyframes(demo, interval):
     assert slam.map.num_keyframes - 1 - adjusted[-1] < interval
 
 
-def test_live_windows_are_adjusted_beside_the_tracking(demo):
+def test_with_a_clock_windows_are_adjusted_beside_the_tracking(demo):
     at_each_keyframe = dataclasses.replace(CONFIG, bundle_adjustment=dataclasses.replace(CONFIG.bundle_adjustment, keyframe_interval=1))
     slam, record = Slam(demo.camera, at_each_keyframe), RunRecord()
     threads, solved = set(), slam._solved
 
     def watched(*task):
         threads.add(threading.current_thread().name)
-        time.sleep(0.15)
+        time.sleep(0.4)  # longer than from keyframe to keyframe
         return solved(*task)
 
     slam._solved = watched
-    run_live(demo, range(90), FrontEnd(CONFIG), slam, record=record)
+    run_live(demo, range(90), FrontEnd(CONFIG), slam, record=record, clock=Clock())
     assert threads == {"vitamin3d-adjustment"} and not slam.adjuster.is_busy
-    assert record.adjustments_skipped == slam.adjustments_skipped > 0
+    assert record.adjustments_awaited == slam.adjustments_awaited > 0
     reference, _ = run("sequential", demo, demo.camera, 90)
     a, b = (np.linalg.norm(np.diff(s.trajectory().T_world_cam[:, :3, 3], axis=0), axis=1).sum() for s in (slam, reference))
     assert abs(a / b - 1) < 0.05
+
+
+def test_without_a_clock_a_live_run_maps_like_a_sequential_one(demo):
+    live, _ = run("sequential", demo, demo.camera, 60)
+    slam = Slam(demo.camera, CONFIG)
+    run_live(demo, range(60), FrontEnd(CONFIG), slam, lambda snapshots: [time.sleep(0.05) for _ in snapshots])
+    np.testing.assert_array_equal(slam.trajectory().T_world_cam, live.trajectory().T_world_cam)
+    np.testing.assert_array_equal(slam.map.points_world, live.map.points_world)
 
 
 def test_live_a_dense_half_without_work_hears_how_late_it_is(demo):
