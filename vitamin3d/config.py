@@ -572,7 +572,9 @@ def paper_config() -> Config:
         consistency=ConsistencyConfig(enabled=False),
         fusion=FusionConfig(max_relative_deviation=1e3),
         calibration=CalibrationConfig(refine="off"),
-        bundle_adjustment=BundleAdjustmentConfig(keyframe_interval=1, keyframe_solver="subspace", keyframe_iterations=20),
+        bundle_adjustment=BundleAdjustmentConfig(
+            keyframe_interval=1, keyframe_solver="subspace", keyframe_iterations=20, points_per_keyframe=0
+        ),
     )
 
 
