@@ -596,7 +596,7 @@ def live_config(base: Config) -> Config:
         memory=change(base.memory, max_keyframes=600, max_new_tracks=60_000),
         densification=change(base.densification, reach=3, planes=32, max_wait_s=1.0),
         nltgv=change(base.nltgv, iterations=min(60, base.nltgv.iterations)),
-        consistency=change(base.consistency, first=1, per_side=1, max_wait_s=1.4),
+        consistency=change(base.consistency, first=1, per_side=1, max_wait_s=1.25),
         fusion=change(base.fusion, keyframes_for_depth=10, backend="blocks"),
     )
 
