@@ -10,7 +10,7 @@ from vitamin3d.geometry.camera import Camera
 from vitamin3d.geometry.rolling_shutter import NO_MOTION, at_one_moment, fit_image_motion, ideal_pixels, measured_pixels, row_shift
 from vitamin3d.geometry.se3 import exp_se3
 from vitamin3d.mapping.calibration_refinement import CalibrationRefinement
-from vitamin3d.mapping.readout_estimation import estimate_readout, frame_interval_s, set_image_motion
+from vitamin3d.mapping.readout_estimation import _block_starts, estimate_readout, frame_interval_s, set_image_motion
 from vitamin3d.types import Frame
 
 CONFIG = CalibrationConfig(
@@ -189,3 +189,8 @@ def test_a_better_image_motion_moves_the_keyframes_pixels(rng):
     before = sparse_map.obs_pixels.copy()
     set_image_motion(sparse_map, 4, 2 * PAN, EUROC)
     np.testing.assert_array_equal(sparse_map.obs_pixels, before)
+
+
+@pytest.mark.parametrize(("keyframes", "most", "starts"), [(40, 3, [0]), (130, 3, [0, 60, 120]), (444, 3, [0, 180, 420]), (444, 1, [0])])
+def test_the_readout_is_looked_for_in_a_few_blocks_spread_over_the_map(keyframes, most, starts):
+    assert _block_starts(keyframes, most).tolist() == starts
