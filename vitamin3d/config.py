@@ -33,6 +33,8 @@ AT_LEAST_ONE = (
     "recovery.interval",
     "bundle_adjustment.keyframe_interval",
     "window.keyframes",
+    "calibration.max_keyframes",
+    "calibration.readout_blocks",
     "densification.keyframe_stride",
     "densification.reach",
     "extrapolation.neighbours",
