@@ -33,14 +33,7 @@ from vitamin3d.mapping.two_view_initialization import initialize_from_two_views
 from vitamin3d.mapping.visible_landmarks import with_unobserved
 from vitamin3d.mapping.window_adjustment import AdjustAtOnce, Adjuster, WindowAdjustment, store_adjustment
 from vitamin3d.mapping.window_prior import WindowPrior
-from vitamin3d.mapping.window_selection import (
-    Window,
-    build_problem,
-    select_frame_window,
-    select_window,
-    store_solution,
-    whole_map,
-)
+from vitamin3d.mapping.window_selection import Window, build_problem, select_frame_window, select_window, store_solution, whole_map
 from vitamin3d.tracking.extrema import refine_extrema, select_free_extrema
 from vitamin3d.tracking.extrema_tracking import predict_by_dense_flow, predict_by_dominant_flow, track_extrema
 from vitamin3d.types import Array, Frame, FrontEndFrame, MapSnapshot, SlamState, StepTimes, Tracks, Trajectory

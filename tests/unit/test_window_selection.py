@@ -74,7 +74,8 @@ def test_the_newest_frame_comes_last_and_free(sparse_map):
     mine = problem.obs_camera == 3
     np.testing.assert_array_equal(problem.landmark_ids[problem.obs_point[mine]], view_ids[known])
     np.testing.assert_array_equal(problem.obs_pixels[mine], pixels[known])
-    assert (problem.obs_rows[mine] == -1).all() and rows_of(problem, window)
+    expected = {(k, id_): i for (k, id_), i in twin(sparse_map, window).items() if id_ in view_ids}
+    assert (problem.obs_rows[mine] == -1).all() and rows_of(problem, window) == expected
 
 
 def test_with_a_newest_frame_only_its_landmarks_take_part(sparse_map):

@@ -34,9 +34,6 @@ SOLVERS: dict[str, Callable[[BundleProblem, Camera, float, int, float], tuple[Bu
 }
 """The tracker's way in: problem in ideal pixels, camera, sigma_px, the most iterations, the relative gain that ends them."""
 
-POINT_SWEEPS = 1
-"""Over the points that were not adjusted together with the cameras."""
-
 
 @dataclass(frozen=True)
 class AdjustmentSettings:
@@ -178,7 +175,7 @@ def adjust_by_long_tracks(
     per_camera: int,
     solve: Callable[[BundleProblem], tuple[BundleProblem, BundleReport]],
 ) -> tuple[BundleProblem, BundleReport]:
-    """Cameras and the points that they see longest by `solve`, about `per_camera` of each; then the other points (Eq. 12).
+    """Cameras and the points that they see longest by `solve`, about `per_camera` of each; then a sweep over all points (Eq. 12).
 
     With per_camera = 0 all points take part in `solve`. The report is that of `solve`.
     """
@@ -190,6 +187,5 @@ def adjust_by_long_tracks(
     points[chosen] = part.points_world
     placed = dataclasses.replace(problem, T_cam_world=part.T_cam_world, points_world=points)
     variables, sightings = Variables.of(placed, pinhole_model(camera)), sightings_of(problem)
-    for _ in range(POINT_SWEEPS):
-        sweep_points(variables.views(free_slots(problem)), sightings, variables.points, 1.0 / sigma_px**2)
+    sweep_points(variables.views(free_slots(problem)), sightings, variables.points, 1.0 / sigma_px**2)
     return dataclasses.replace(placed, points_world=variables.points), report
