@@ -247,6 +247,8 @@ class FinalAdjustmentConfig:
     outlier_px: float = 3.0
     iterations: int = 6
     relative_gain: float = 3e-3
+    points_per_keyframe: int = 0
+    """Of the stricter round, as of the windows."""
     max_keyframes: int = 1000
     """Longer maps are left as they are: the reduced camera system grows with the square of the keyframes."""
 

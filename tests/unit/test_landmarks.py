@@ -358,6 +358,23 @@ def test_depth_deviation_is_what_noise_does_to_the_depth(scene, rng):
     assert deviation[0] == pytest.approx(depths.std() / depths.mean(), rel=0.03)
 
 
+def test_depth_deviation_equals_that_of_the_inverted_information(rng):
+    J, X = rng.normal(size=(300, 4, 3)), rng.normal(size=(300, 3)) + [0.0, 0.0, 5.0]
+    J[::3, 2:] = 0.0  # undetermined
+    J[1::3, :, 2] *= 1e-3  # hardly determined along one axis
+    T = np.stack([exp_se3(0.2 * rng.normal(size=6)) for _ in X])
+    information = np.einsum("nki,nkj->nij", J, J)
+    for poses in (T, T[0]):
+        axes, shifts = np.broadcast_to(poses[..., 2, :3], X.shape), np.broadcast_to(poses[..., 2, 3], len(X))
+        found = relative_depth_deviations(information, X, poses)
+        for n, axis in enumerate(axes):
+            if n % 3 == 0:
+                assert found[n] == np.inf
+            else:
+                expected = np.sqrt(axis @ np.linalg.inv(information[n]) @ axis) / (axis @ X[n] + shifts[n])
+                assert found[n] == pytest.approx(expected, rel=1e-4)
+
+
 def test_one_view_leaves_the_depth_open(scene):
     sparse_map = map_of(scene)
     rows = [i for i, _ in reference.counting_observations(sparse_map, 5)]

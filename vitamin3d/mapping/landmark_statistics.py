@@ -14,6 +14,9 @@ from vitamin3d.geometry.se3 import inverse
 from vitamin3d.mapping.sparse_map import SparseMap
 from vitamin3d.types import Array, PointCloud
 
+LEAST_DETERMINANT = 1e-15
+"""Of an information over its trace cubed; below it the landmark is undetermined, as far as numbers can tell."""
+
 
 @kernel
 def _information(intrinsics, R, t, starts, obs_landmark, obs_valid, obs_pixels, first, points, wanted, H, squared, count):  # type: ignore[no-untyped-def]
@@ -61,6 +64,22 @@ def _farthest_rays(centers, starts, obs_landmark, obs_valid, first, points, refe
             cosine = x * reference[id_, 0] + y * reference[id_, 1] + z * reference[id_, 2]
             if cosine <= low[id_]:
                 low[id_], farthest[id_, 0], farthest[id_, 1], farthest[id_, 2] = cosine, x, y, z
+
+
+@kernel
+def _deviate(information, points, poses, out):  # type: ignore[no-untyped-def]
+    """sqrt(zᵀ C z) over the depth, z the camera's axis in the world and C the inverse of the information, by its cofactors."""
+    for n in range(points.shape[0]):
+        a, b, c = information[n, 0]
+        d, e, f = information[n, 1, 1], information[n, 1, 2], information[n, 2, 2]
+        aa, bb, cc = d * f - e * e, c * e - b * f, b * e - c * d
+        det, trace = a * aa + b * bb + c * cc, a + d + f
+        x, y, z = poses[n, 2, 0], poses[n, 2, 1], poses[n, 2, 2]
+        depth = x * points[n, 0] + y * points[n, 1] + z * points[n, 2] + poses[n, 2, 3]
+        along = x * x * aa + y * y * (a * f - c * c) + z * z * (a * d - b * b)
+        across = x * y * bb + x * z * cc + y * z * (b * c - a * e)
+        is_regular = det > LEAST_DETERMINANT * trace * trace * trace
+        out[n] = np.sqrt(max((along + 2.0 * across) / det, 0.0)) / max(depth, 1e-12) if is_regular else np.inf
 
 
 @dataclass(frozen=True)
@@ -162,14 +181,9 @@ def relative_depth_deviations(information: Array, points_world: Array, T_cam_wor
         points_world: (N, 3).
         T_cam_world: (4, 4) or (N, 4, 4).
     """
-    regular = np.linalg.det(information) > 1e-12 * np.einsum("nii->n", information) ** 3 * 1e-6
-    covariance = np.full_like(information, np.inf)
-    covariance[regular] = np.linalg.inv(information[regular])
-    axis = np.broadcast_to(T_cam_world[..., 2, :3], points_world.shape)
-    depth = (axis * points_world).sum(axis=1) + T_cam_world[..., 2, 3]
-    with np.errstate(invalid="ignore"):
-        variance = np.einsum("ni,nij,nj->n", axis, covariance, axis)
-    return np.where(regular, np.sqrt(np.maximum(variance, 0.0)) / np.maximum(depth, 1e-12), np.inf)
+    out, poses = np.empty(len(points_world)), np.broadcast_to(T_cam_world, (len(points_world), 4, 4))
+    _deviate(np.ascontiguousarray(information), np.ascontiguousarray(points_world), poses, out)
+    return out
 
 
 class Vertices(NamedTuple):
