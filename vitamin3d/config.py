@@ -218,17 +218,18 @@ class BundleAdjustmentConfig:
     """Sec. 3, Eq. 6–12."""
 
     sigma_px: float = 2.0
-    sweeps_per_frame: int = 2
-    """Subspace Gauss–Newton sweeps over the newest keyframes and the frame's landmarks, at every frame (Eq. 11–12)."""
+    sweeps_per_frame: int = 0
+    """Subspace Gauss–Newton sweeps over the newest keyframes and the frame's landmarks, at every frame (Eq. 11–12). Where frames are
+    localised by thousands of landmarks they gain nothing more (docs/bundle_adjustment.md)."""
     keyframe_solver: str = "subspace-accelerated"
     """Solver of the window at each keyframe: `subspace-accelerated` (cameras together with the points eliminated, then each
     point alone), `schur` (the former only), `subspace` (Eq. 11–12) or `subspace-inner` (several sweeps with the same derivatives)."""
-    keyframe_interval: int = 3
+    keyframe_interval: int = 4
     """The window is adjusted at every so many-th keyframe: a long window now and then holds better than a short one each time."""
     keyframe_iterations: int = 6
     relative_gain: float = 1e-3
     """An adjustment ends when a step lowers the cost by less than this share."""
-    points_per_keyframe: int = 400
+    points_per_keyframe: int = 250
     """About so many points of each keyframe, those of the longest tracks, are adjusted together with the cameras at a keyframe;
     the others are then moved to them. 0: all."""
     frame_keyframes: int = 4
@@ -246,9 +247,7 @@ class FinalAdjustmentConfig:
     sigma_px: float = 1.0
     outlier_px: float = 3.0
     iterations: int = 6
-    relative_gain: float = 3e-3
-    points_per_keyframe: int = 0
-    """Of the stricter round, as of the windows."""
+    relative_gain: float = 1e-2
     max_keyframes: int = 1000
     """Longer maps are left as they are: the reduced camera system grows with the square of the keyframes."""
 
@@ -262,7 +261,7 @@ class CalibrationConfig:
     parameters: str = "f k1"
     """Free ones out of f fx fy cx cy k1 k2 p1 p2; `f` moves fx and fy together."""
     first_keyframes: int = 20
-    growth: float = 2.0
+    growth: float = 3.0
     """The next refinement is due when the map has grown by this factor; one more comes at the end."""
     max_keyframes: int = 120
     """Of a longer map so many keyframes take part, spread evenly; the others are then moved to the new camera."""
@@ -342,8 +341,10 @@ class DensificationConfig:
     """Depths of textured pixels between the landmarks, from neighbouring keyframes; not in the paper."""
 
     enabled: bool = True
-    keyframe_stride: int = 2
-    """Every so many-th keyframe is densified and fused; the others serve as its neighbours."""
+    keyframe_stride: int = 5
+    """Every so many-th keyframe is densified and fused, the others serve as its neighbours;"""
+    view_motion_px: float = 120.0
+    """and one in between where the last one's landmarks have moved by so many pixels (their median)."""
     reach: int = 13
     """Keyframes before and after among which neighbours are looked for."""
     max_wait_s: float = 0.0
@@ -354,7 +355,7 @@ class DensificationConfig:
     min_overlap: float = 0.5
     """Share of the landmarks that a neighbour must see."""
     min_landmarks: int = 30
-    planes: int = 64
+    planes: int = 48
     small_penalty: float = 5.0
     """Of a step to the next plane, in bits of the census."""
     edge_penalty: float = 50.0
@@ -434,11 +435,11 @@ class ConsistencyConfig:
     """Before fusion, the views around a view confirm or contradict its depths: their votes change the weights."""
 
     enabled: bool = True
-    first: int = 2
+    first: int = 1
     """The voters are the views so many before and after in the order of fusion,"""
-    spacing: int = 3
+    spacing: int = 2
     """and the ones so many further,"""
-    per_side: int = 3
+    per_side: int = 2
     """together so many on each side."""
     max_wait_s: float = 0.0
     """A view waits no longer for later voters when the camera is so many seconds further; 0: however long it takes."""
@@ -494,7 +495,7 @@ class FusionConfig:
     keyframes_for_depth: int = 30
     """Keyframes whose depths decide the voxels; fusion waits for them where the voxels are not given."""
     truncation_voxels: float = 3.0
-    max_relative_deviation: float = 0.04
+    max_relative_deviation: float = 0.05
     """Pixels whose depth has a larger deviation, relative to the depth, are not fused (not of `blocks`)."""
     max_deviation_voxels: float = 4.5
     """The surface ends where all views together leave a larger deviation of the depth (`blocks` alone)."""
@@ -577,7 +578,7 @@ def paper_config() -> Config:
         fusion=FusionConfig(max_relative_deviation=1e3),
         calibration=CalibrationConfig(refine="off"),
         bundle_adjustment=BundleAdjustmentConfig(
-            keyframe_interval=1, keyframe_solver="subspace", keyframe_iterations=20, points_per_keyframe=0
+            sweeps_per_frame=2, keyframe_interval=1, keyframe_solver="subspace", keyframe_iterations=20, points_per_keyframe=0
         ),
     )
 
@@ -598,7 +599,7 @@ def live_config(base: Config) -> Config:
         final_adjustment=change(base.final_adjustment, enabled=False),
         calibration=change(base.calibration, refine="off"),
         memory=change(base.memory, max_keyframes=600, max_new_tracks=60_000),
-        densification=change(base.densification, reach=3, planes=32, max_wait_s=1.0),
+        densification=change(base.densification, keyframe_stride=2, reach=3, planes=32, max_wait_s=1.0),
         nltgv=change(base.nltgv, iterations=min(60, base.nltgv.iterations)),
         consistency=change(base.consistency, first=1, per_side=1, max_wait_s=1.25),
         fusion=change(base.fusion, keyframes_for_depth=10, backend="blocks"),

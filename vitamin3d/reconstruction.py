@@ -18,6 +18,7 @@ from vitamin3d.dense.nltgv import denoise
 from vitamin3d.dense.photometric_check import marked, photometrically_checked
 from vitamin3d.dense.surface_extraction import clean
 from vitamin3d.dense.tsdf_fusion import Limits, TsdfVolume, empty_surface
+from vitamin3d.dense.view_selection import ViewSelection
 from vitamin3d.dense.view_store import Packed, ViewStore, packed
 from vitamin3d.geometry.camera import Camera
 from vitamin3d.geometry.se3 import inverse
@@ -50,8 +51,9 @@ class Reconstruction:
         self._border = outline(camera, config.extrapolation.spacing_px)
         densification = config.densification
         self._densifier = Densifier(camera, self.renderer.canvas, densification)
-        self._keyframes: NeighbourQueue[CanvasPicture] = NeighbourQueue(densification.reach, densification.keyframe_stride)
-        self._drawn: NeighbourQueue[DepthView] = NeighbourQueue(config.consistency.reach if self._is_checked else 0, 1)
+        selection = ViewSelection(camera, densification.keyframe_stride, densification.view_motion_px)
+        self._keyframes: NeighbourQueue[CanvasPicture] = NeighbourQueue(densification.reach, lambda p: selection.is_view(p.snapshot))
+        self._drawn: NeighbourQueue[DepthView] = NeighbourQueue(config.consistency.reach if self._is_checked else 0)
         self.median_depths: list[float] = []
         self._waiting: list[DepthView] = []
         self.low: TsdfVolume | None = None

@@ -388,7 +388,7 @@ class Slam:
             self._refine_calibration()
         with self.times.timed("final_adjustment"):
             self._adjust_whole_map(window_round.sigma_px, window_round.outlier_px, window_round.points_per_keyframe)
-            self._adjust_whole_map(final.sigma_px, final.outlier_px, final.points_per_keyframe)
+            self._adjust_whole_map(final.sigma_px, final.outlier_px, per_keyframe=0)
 
     def _adjust_whole_map(self, sigma_px: float, outlier_px: float, per_keyframe: int) -> None:
         final, everything = self.config.final_adjustment, whole_map(self.map)

@@ -359,7 +359,7 @@ def test_depth_deviation_is_what_noise_does_to_the_depth(scene, rng):
 
 
 def test_depth_deviation_equals_that_of_the_inverted_information(rng):
-    J, X = rng.normal(size=(300, 4, 3)), rng.normal(size=(300, 3)) + [0.0, 0.0, 5.0]
+    J, X = rng.normal(size=(300, 4, 3)), rng.normal([0.0, 0.0, 5.0], size=(300, 3))
     J[::3, 2:] = 0.0  # undetermined
     J[1::3, :, 2] *= 1e-3  # hardly determined along one axis
     T = np.stack([exp_se3(0.2 * rng.normal(size=6)) for _ in X])

@@ -97,12 +97,13 @@ def test_retract_is_the_exponential_from_the_left(rng, size):
 
 @pytest.mark.parametrize(("r", "sigma"), [(0.0, 1.0), (0.3, 1.0), (1.0, 1.0), (2.0, 0.7), (100.0, 2.0)])
 def test_geman_mcclure_equals_its_twin(r, sigma):
-    assert robust.geman_mcclure_cost(r * r, sigma * sigma) == pytest.approx(reference.geman_mcclure(r, sigma), rel=1e-14)
-    assert robust.geman_mcclure_weight(r * r, sigma * sigma) == pytest.approx(reference.geman_mcclure_weight(r, sigma), rel=1e-14)
+    cost, weight = robust.geman_mcclure(r * r, 1.0 / sigma**2)
+    assert cost == pytest.approx(reference.geman_mcclure(r, sigma), rel=1e-14)
+    assert weight == pytest.approx(reference.geman_mcclure_weight(r, sigma), rel=1e-14)
 
 
 def test_geman_mcclure_starts_as_the_square_and_saturates():
-    assert robust.geman_mcclure_cost(1e-6, 4.0) == pytest.approx(1e-6, rel=1e-5)
-    assert 3.99 < robust.geman_mcclure_cost(1e6, 4.0) < 4.0
-    assert robust.geman_mcclure_weight(0.0, 4.0) == 1.0
-    assert robust.geman_mcclure_weight(4.0, 4.0) == pytest.approx(0.25)
+    assert robust.geman_mcclure(1e-6, 0.25)[0] == pytest.approx(1e-6, rel=1e-5)
+    assert 3.99 < robust.geman_mcclure(1e6, 0.25)[0] < 4.0
+    assert [robust.geman_mcclure(e, 0.25)[1] for e in (0.0, 4.0)] == pytest.approx([1.0, 0.25])
+    assert robust.geman_mcclure(7.0, 0.0) == (7.0, 1.0)

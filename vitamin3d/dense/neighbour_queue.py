@@ -3,6 +3,7 @@
 
 from collections.abc import Callable
 from dataclasses import dataclass
+from itertools import takewhile
 from typing import Generic, TypeVar
 
 Item = TypeVar("Item")
@@ -20,24 +21,30 @@ class Around(Generic[Item]):
 
 
 class NeighbourQueue(Generic[Item]):
-    """Lets items wait until those that come after them are there too; every `stride`-th comes out, with its neighbours."""
+    """Lets items wait until those that come after them are there too; the wanted ones come out, with their neighbours.
 
-    def __init__(self, reach: int, stride: int) -> None:
-        self._reach, self._stride = reach, stride
+    Args:
+        reach: how many before and after one are its neighbours.
+        is_wanted: asked about each item once, in the order of time; None: all are wanted.
+    """
+
+    def __init__(self, reach: int, is_wanted: Callable[[Item], bool] | None = None) -> None:
+        self._reach, self._is_wanted = reach, is_wanted
         self._items: list[Item] = []
-        self._first, self._next = 0, 0
+        self._wanted: list[int] = []
+        self._first = 0
 
     def push(self, item: Item) -> list[Around[Item]]:
         """Adds one, in the order of time; those that are ready."""
+        if self._is_wanted is None or self._is_wanted(item):
+            self._wanted.append(self._first + len(self._items))
         self._items.append(item)
         return self._taken(self._first + len(self._items) - self._reach)
 
     def expire(self, is_late: Callable[[Item], bool]) -> list[Around[Item]]:
         """Those that have waited too long, with the neighbours that are there."""
-        end = self._next
-        while end < self._first + len(self._items) and is_late(self._items[end - self._first]):
-            end += self._stride
-        return self._taken(end)
+        late = takewhile(lambda at: is_late(self._items[at - self._first]), self._wanted)
+        return self._taken(1 + max(late, default=-1))
 
     def flush(self) -> list[Around[Item]]:
         """Those that still wait: none will follow."""
@@ -46,15 +53,17 @@ class NeighbourQueue(Generic[Item]):
     def clear(self) -> None:
         """Drops those that wait."""
         self._first += len(self._items)
-        self._next, self._items = max(self._next, self._first), []
+        self._wanted, self._items = [], []
 
     def _taken(self, end: int) -> list[Around[Item]]:
-        ready = []
-        while self._next < end:
-            at = self._next - self._first
-            before, after = self._items[max(0, at - self._reach) : at][::-1], self._items[at + 1 : at + 1 + self._reach]
-            ready.append(Around(self._items[at], before, after))
-            self._next += self._stride
-            stale = min(max(0, self._next - self._reach - self._first), len(self._items))
-            self._items, self._first = self._items[stale:], self._first + stale
+        """The wanted ones before the `end`-th, which leave; what is no neighbour of a later one is forgotten."""
+        ready = [self._around(at - self._first) for at in self._wanted if at < end]
+        self._wanted = self._wanted[len(ready) :]
+        next_one = self._wanted[0] if self._wanted else self._first + len(self._items)
+        stale = max(0, next_one - self._reach - self._first)
+        self._items, self._first = self._items[stale:], self._first + stale
         return ready
+
+    def _around(self, at: int) -> Around[Item]:
+        before, after = self._items[max(0, at - self._reach) : at], self._items[at + 1 : at + 1 + self._reach]
+        return Around(self._items[at], before[::-1], after)

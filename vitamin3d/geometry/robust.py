@@ -8,20 +8,10 @@ from vitamin3d._jit import inlined
 
 
 @inlined
-def geman_mcclure_cost(squared_residual, squared_sigma):  # type: ignore[no-untyped-def]
-    """rho(r) of r² and sigma², both in pixels²; saturates at sigma²."""
-    return squared_sigma * squared_residual / (squared_residual + squared_sigma)
-
-
-@inlined
-def geman_mcclure_weight(squared_residual, squared_sigma):  # type: ignore[no-untyped-def]
-    """rho'(r) / (2 r) = sigma⁴ / (r² + sigma²)², the weight of iteratively reweighted least squares; 1 at r = 0."""
-    w = squared_sigma / (squared_residual + squared_sigma)
-    return w * w
-
-
-@inlined
 def geman_mcclure(squared_residual, inverse_squared_sigma):  # type: ignore[no-untyped-def]
-    """Cost and weight of r² with one division; 0 for 1 / sigma² is plain least squares."""
+    """rho(r), which saturates at sigma², and rho'(r) / (2 r), the weight of iteratively reweighted least squares, 1 at r = 0.
+
+    Of r² in pixels² and 1 / sigma²; with 0 for the latter it is plain least squares.
+    """
     k = 1.0 / (1.0 + squared_residual * inverse_squared_sigma)
     return squared_residual * k, k * k

@@ -3,61 +3,78 @@
 
 import numpy as np
 
-from vitamin3d._jit import kernel
+from vitamin3d._jit import inlined, kernel
+from vitamin3d._lanes import WIDTH, counting, gather, lanes, select, total
+from vitamin3d.bundle_adjustment.normal_equations import add_camera, no_camera, write_camera
+from vitamin3d.bundle_adjustment.observations import information, robust_cost
+from vitamin3d.bundle_adjustment.subspace import new_scratch, solve_6x6
+from vitamin3d.bundle_adjustment.variables import pinhole_model
 from vitamin3d.config import LocalizationConfig
 from vitamin3d.geometry.camera import Camera
 from vitamin3d.geometry.p3p import p3p_ransac
-from vitamin3d.geometry.reprojection import linearize, reprojection_errors, retract, squared_error
-from vitamin3d.geometry.robust import geman_mcclure_cost, geman_mcclure_weight
+from vitamin3d.geometry.reprojection import (
+    in_camera,
+    linearize_lanes,
+    model_of,
+    points_of,
+    pose_of,
+    reprojection_errors,
+    retract,
+    squared_error_lanes,
+)
 from vitamin3d.types import Array, Localization
 
 ROUGH_GAIN = 1e-2
 """A pose that only has to tell inliers from outliers is refined until a step gains less than this share of the cost."""
 
 
-@kernel
-def _normal_equations(intrinsics, R, t, points, pixels, squared_sigma, H, g):  # type: ignore[no-untyped-def]
-    r, J, J_point = np.empty(2), np.empty((2, 6)), np.empty((2, 3))
-    H[:, :] = 0.0
-    g[:] = 0.0
-    for i in range(points.shape[0]):
-        if not linearize(intrinsics, R, t, points[i], pixels[i], r, J, J_point):
-            continue
-        w = geman_mcclure_weight(r[0] * r[0] + r[1] * r[1], squared_sigma)
-        for m in range(6):
-            g[m] += w * (J[0, m] * r[0] + J[1, m] * r[1])
-            for n in range(m, 6):
-                H[m, n] += w * (J[0, m] * J[0, n] + J[1, m] * J[1, n])
-    for m in range(6):
-        for n in range(m):
-            H[m, n] = H[n, m]
+@inlined
+def _rows(points, pixels, pose, i):  # type: ignore[no-untyped-def]
+    """Eight correspondences from the i-th: which of them are there, the points in the camera frame, the pixels."""
+    rows = counting(i)
+    is_there = rows < points.shape[0]
+    rows = select(is_there, rows, i)
+    X, Y, Z = points_of(points, rows)
+    x, y, z = in_camera(pose, X, Y, Z)
+    return is_there, x, y, z, gather(pixels, 2 * rows), gather(pixels, 2 * rows + 1)
 
 
 @kernel
-def _cost(intrinsics, R, t, points, pixels, squared_sigma):  # type: ignore[no-untyped-def]
-    total = 0.0
-    for i in range(points.shape[0]):
-        e = squared_error(intrinsics, R, t, points[i], pixels[i])
-        total += squared_sigma if e == np.inf else geman_mcclure_cost(e, squared_sigma)
-    return total
+def _cost(models, R, t, points, pixels, inverse_squared_sigma):  # type: ignore[no-untyped-def]
+    model, pose, cost = model_of(models, 0), pose_of(R, t, 0), lanes(0.0)
+    for i in range(0, points.shape[0], WIDTH):
+        is_there, x, y, z, u, v = _rows(points, pixels, pose, i)
+        cost = cost + robust_cost(is_there, squared_error_lanes(x, y, z, False, model, u, v), inverse_squared_sigma)
+    return total(cost)
 
 
 @kernel
-def _refine(intrinsics, R, t, points, pixels, squared_sigma, iterations, relative_gain):  # type: ignore[no-untyped-def]
-    """Levenberg–Marquardt in place on R (3, 3), t (3,); the cost never rises. NaN input moves nothing."""
-    H, g, R_new, t_new = np.empty((6, 6)), np.empty(6), np.empty((3, 3)), np.empty(3)
-    damping, cost = 1e-6, _cost(intrinsics, R, t, points, pixels, squared_sigma)
-    if np.isnan(cost):
-        return
+def _normal_equations(models, R, t, points, pixels, inverse_squared_sigma, sums, H, g):  # type: ignore[no-untyped-def]
+    """Fills H (6, 6), upper triangle, and g (6,); `sums` (27,) is memory."""
+    model, pose, block = model_of(models, 0), pose_of(R, t, 0), no_camera()
+    for i in range(0, points.shape[0], WIDTH):
+        is_there, x, y, z, u, v = _rows(points, pixels, pose, i)
+        is_seen, q, a, b, r0, r1, p00, p01, p10, p11 = linearize_lanes(x, y, z, False, model, u, v)
+        _, _, g00, g01, g11, h0, h1, _, _, _ = information(is_there, is_seen, r0, r1, p00, p01, p10, p11, inverse_squared_sigma, 0.0)
+        block = add_camera(block, q, a, b, g00, g01, g11, h0, h1)
+    write_camera(block, sums, H, g)
+
+
+@kernel
+def _refine(models, R, t, points, pixels, inverse_squared_sigma, iterations, relative_gain, scratch):  # type: ignore[no-untyped-def]
+    """Levenberg–Marquardt in place on R (1, 3, 3), t (1, 3); the cost never rises. NaN input moves nothing."""
+    sums, H, g, delta, R_new, t_new = scratch
+    damping, cost = 1e-6, _cost(models, R, t, points, pixels, inverse_squared_sigma)
     for _ in range(iterations):
-        _normal_equations(intrinsics, R, t, points, pixels, squared_sigma, H, g)
+        _normal_equations(models, R, t, points, pixels, inverse_squared_sigma, sums, H[0], g)
         for m in range(6):
-            H[m, m] += damping * H[m, m] + 1e-12
-        delta = -np.linalg.solve(H, g)
-        retract(delta, R, t, R_new, t_new)
-        new_cost = _cost(intrinsics, R_new, t_new, points, pixels, squared_sigma)
+            H[0, m, m] += damping * H[0, m, m] + 1e-12
+        new_cost = np.inf
+        if solve_6x6(H, g, delta):
+            retract(delta, R[0], t[0], R_new[0], t_new[0])
+            new_cost = _cost(models, R_new, t_new, points, pixels, inverse_squared_sigma)
         if new_cost <= cost:
-            R[:, :], t[:] = R_new, t_new
+            R[:], t[:] = R_new, t_new
             gain, cost, damping = cost - new_cost, new_cost, max(1e-9, 0.1 * damping)
             if gain <= relative_gain * cost:
                 break
@@ -75,12 +92,13 @@ def refine_pose(
     It ends when a step gains less than relative_gain of the cost.
     """
     refined = np.array(T_cam_world)
-    R, t = np.ascontiguousarray(refined[:3, :3]), np.ascontiguousarray(refined[:3, 3])
+    R, t = np.ascontiguousarray(refined[None, :3, :3]), np.ascontiguousarray(refined[None, :3, 3])
     _refine(
-        camera.intrinsics, R, t, np.ascontiguousarray(points_world), np.ascontiguousarray(pixels), sigma_px**2, iterations, relative_gain
-    )
-    U, _, Vt = np.linalg.svd(R)
-    refined[:3, :3], refined[:3, 3] = U @ Vt, t
+        pinhole_model(camera), R, t, np.ascontiguousarray(points_world), np.ascontiguousarray(pixels), 1.0 / sigma_px**2, iterations,
+        relative_gain, new_scratch(),
+    )  # fmt: skip
+    U, _, Vt = np.linalg.svd(R[0])
+    refined[:3, :3], refined[:3, 3] = U @ Vt, t[0]
     return refined
 
 

@@ -16,6 +16,12 @@ PATCH_PX = 9
 
 
 @kernel
+def _find_mapped(points, ids, found):  # type: ignore[no-untyped-def]
+    for i in range(ids.shape[0]):
+        found[i] = ids[i] < points.shape[0] and not np.isnan(points[ids[i], 0])
+
+
+@kernel
 def _relabel(starts, obs_landmark, obs_valid, first, new_id, is_target, count, first_new, last_new):  # type: ignore[no-untyped-def]
     """Gives observations of landmark i to new_id[i] (where >= 0) unless that has one in the same keyframe; recounts the targets.
 
@@ -164,9 +170,8 @@ class SparseMap:
 
     def is_mapped(self, ids: Array) -> Array:
         """(N,) bool: which track ids (N,) are landmarks."""
-        known = ids < self._points.size
-        out = np.zeros(len(ids), np.bool_)
-        out[known] = ~np.isnan(self.points_world[ids[known], 0])
+        out = np.empty(len(ids), np.bool_)
+        _find_mapped(self.points_world, ids, out)
         return out
 
     def add_keyframe(
