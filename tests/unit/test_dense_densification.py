@@ -130,7 +130,7 @@ def test_the_border_of_the_canvas_is_no_picture():
 
 @pytest.mark.parametrize(("reach", "stride", "count"), [(2, 1, 7), (3, 2, 8), (1, 5, 12), (4, 3, 3), (0, 1, 4)])
 def test_the_queue_gives_each_its_neighbours(reach, stride, count):
-    queue: NeighbourQueue[int] = NeighbourQueue(reach, stride)
+    queue: NeighbourQueue[int] = NeighbourQueue(reach, lambda k: k % stride == 0)
     ready = [around for k in range(count) for around in queue.push(k)] + queue.flush() + queue.flush()
     numbers = [(r.item, r.before, r.after) for r in ready]
     expected = [
@@ -144,7 +144,7 @@ def test_a_denser_keyframe_makes_a_better_surface():
     config = dataclasses.replace(Config(), delaunay=DelaunayConfig(min_vertices=20), surface=SurfaceConfig(min_component_triangles=20))
     covered = {}
     for enabled in (True, False):
-        densification = dataclasses.replace(config.densification, enabled=enabled)
+        densification = dataclasses.replace(config.densification, enabled=enabled, keyframe_stride=2)
         reconstruction = Reconstruction(CAMERA, dataclasses.replace(config, densification=densification))
         views = list(reconstruction.depth_views(p.snapshot for p in scene()))
         assert len(views) == (4 if enabled else 7)
@@ -153,7 +153,7 @@ def test_a_denser_keyframe_makes_a_better_surface():
 
 
 def test_who_waited_too_long_goes_with_the_neighbours_there_are():
-    queue: NeighbourQueue[int] = NeighbourQueue(3, 2)
+    queue: NeighbourQueue[int] = NeighbourQueue(3, lambda k: k % 2 == 0)
     assert [queue.push(k) for k in range(3)] == [[], [], []]
     (late,) = queue.expire(lambda item: item < 2)
     assert (late.item, late.before, late.after) == (0, [], [1, 2])

@@ -67,13 +67,15 @@ def _root(parents, v):  # type: ignore[no-untyped-def]
 def _count_connected(triangles, parents, counts, sizes):  # type: ignore[no-untyped-def]
     """`parents` (V,) come as each its own, `counts` (V,) as 0."""
     for f in range(triangles.shape[0]):
-        for k in range(2):
-            a, b = _root(parents, triangles[f, k]), _root(parents, triangles[f, k + 1])
-            parents[max(a, b)] = min(a, b)
+        a, b, c = _root(parents, triangles[f, 0]), _root(parents, triangles[f, 1]), _root(parents, triangles[f, 2])
+        first = min(a, min(b, c))
+        parents[a], parents[b], parents[c] = first, first, first
+    for v in range(parents.shape[0]):
+        parents[v] = parents[parents[v]]  # the parent has the smaller number: its own is the first of the piece already
     for f in range(triangles.shape[0]):
-        counts[_root(parents, triangles[f, 0])] += 1
+        counts[parents[triangles[f, 0]]] += 1
     for f in range(triangles.shape[0]):
-        sizes[f] = counts[_root(parents, triangles[f, 0])]
+        sizes[f] = counts[parents[triangles[f, 0]]]
 
 
 @inlined

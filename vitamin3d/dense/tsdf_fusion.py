@@ -13,7 +13,9 @@ from vitamin3d.geometry.camera import Camera
 from vitamin3d.types import Array, DepthView, Surface
 
 BLOCK_RESOLUTION = 16
-"""Voxels along the side of a block; both backends allocate by blocks."""
+"""Voxels along the side of a block; all backends allocate by blocks."""
+ALLOCATION_STRIDE = 8
+"""Open3D's volume allocates for every so many-th pixel in both directions; a fine block is some hundred of them wide."""
 
 
 @dataclass(frozen=True)
@@ -99,7 +101,7 @@ class _ScalableVolume:
             sdf_trunc=truncation,
             color_type=o3d.pipelines.integration.TSDFVolumeColorType.RGB8,
             volume_unit_resolution=BLOCK_RESOLUTION,
-            depth_sampling_stride=4,
+            depth_sampling_stride=ALLOCATION_STRIDE,
         )
 
     def integrate(self, view: DepthView, canvas: Camera, max_depth: float) -> None:
