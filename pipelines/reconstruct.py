@@ -32,7 +32,7 @@ def main(argv: list[str] | None = None) -> int:
         return 3
     slam.finish()  # adjusts the whole map once more
 
-    reconstruction = Reconstruction(slam.camera, config)  # meshes, denoises and fuses the keyframes
+    reconstruction = Reconstruction(slam.camera, config, num_keyframes=slam.map.num_keyframes)  # meshes, denoises and fuses the keyframes
     for keyframe, index in enumerate(slam.map.frame_indices):
         frame = dataset.read(index)
         if not isinstance(frame, Unreadable):

@@ -142,7 +142,7 @@ def run_sparse(dataset: Dataset | Looped, frames: int, config: Config, with_riva
 
 def run_dense(dataset: Dataset, made: Measured, config: Config, scale: Scale) -> Reconstruction:
     """The dense half over all keyframes of the finished map."""
-    reconstruction = Reconstruction(made.slam.camera, with_voxels(config, scale))
+    reconstruction = Reconstruction(made.slam.camera, with_voxels(config, scale), num_keyframes=made.slam.map.num_keyframes)
     reconstruction.times.clock = time.thread_time
     begun = time.thread_time()
     by_id, count = information_by_id(made.slam.map, made.slam.camera), made.slam.map.num_keyframes

@@ -36,6 +36,8 @@ AT_LEAST_ONE = (
     "calibration.max_keyframes",
     "calibration.readout_blocks",
     "densification.keyframe_stride",
+    "densification.max_views",
+    "densification.max_stride",
     "densification.reach",
     "extrapolation.neighbours",
     "consistency.first",
@@ -341,8 +343,12 @@ class DensificationConfig:
     """Depths of textured pixels between the landmarks, from neighbouring keyframes; not in the paper."""
 
     enabled: bool = True
-    keyframe_stride: int = 5
+    keyframe_stride: int = 2
     """Every so many-th keyframe is densified and fused, the others serve as its neighbours;"""
+    max_views: int = 80
+    """where a finished map would then give more, at larger steps,"""
+    max_stride: int = 5
+    """but at least every so many-th;"""
     view_motion_px: float = 120.0
     """and one in between where the last one's landmarks have moved by so many pixels (their median)."""
     reach: int = 13
@@ -492,7 +498,7 @@ class FusionConfig:
     voxel_high: float | None = None
     depth_per_voxel_low: float = 20.0
     depth_per_voxel_high: float = 120.0
-    keyframes_for_depth: int = 30
+    keyframes_for_depth: int = 12
     """Keyframes whose depths decide the voxels; fusion waits for them where the voxels are not given."""
     truncation_voxels: float = 3.0
     max_relative_deviation: float = 0.05
@@ -599,7 +605,7 @@ def live_config(base: Config) -> Config:
         final_adjustment=change(base.final_adjustment, enabled=False),
         calibration=change(base.calibration, refine="off"),
         memory=change(base.memory, max_keyframes=600, max_new_tracks=60_000),
-        densification=change(base.densification, keyframe_stride=2, reach=3, planes=32, max_wait_s=1.0),
+        densification=change(base.densification, reach=3, planes=32, max_wait_s=1.0),
         nltgv=change(base.nltgv, iterations=min(60, base.nltgv.iterations)),
         consistency=change(base.consistency, first=1, per_side=1, max_wait_s=1.25),
         fusion=change(base.fusion, keyframes_for_depth=10, backend="blocks"),

@@ -125,7 +125,7 @@ class _JobRun:
         if self.job.live and self.slam.map.num_keyframes:
             self.dense.fuse_again(self.slam.trajectory())
         if self.slam.map.num_keyframes and not self.job.live:
-            self.dense.camera = self.slam.camera
+            self.dense.camera, self.dense.num_keyframes = self.slam.camera, self.slam.map.num_keyframes
             if self.job.scale_from_truth:
                 self.dense.scale = scale_from_ground_truth(self.slam.trajectory(), self.dataset.ground_truth())
             self.dense.add_all(self._snapshots(), self._keyframe_done)
@@ -229,6 +229,8 @@ class _Dense:
     def __init__(self, dataset: Dataset, job: Job, output: OutputFolder, scale: Scale, clock: Clock | None) -> None:
         self.job, self.output, self.scale, self.camera, self.clock = job, output, scale, dataset.camera, clock
         self.reconstruction: Reconstruction | None = None
+        self.num_keyframes = 0
+        """Of the finished map; 0: they come while the camera is tracked."""
         self.num_moved = 0
         """Views that were fused anew because their keyframe had moved."""
         self.empty_meshes = ["mesh_low", "mesh_high"]
@@ -289,7 +291,8 @@ class _Dense:
 
     def _begun(self) -> Reconstruction:
         if self.reconstruction is None:
-            self.reconstruction = Reconstruction(self.camera, with_voxels(self.job.config, self.scale), keeps_views=self.job.live)
+            config = with_voxels(self.job.config, self.scale)
+            self.reconstruction = Reconstruction(self.camera, config, keeps_views=self.job.live, num_keyframes=self.num_keyframes)
             self.output.write_canvas(self.reconstruction.canvas, self.scale)
         return self.reconstruction
 

@@ -18,7 +18,7 @@ from vitamin3d.dense.nltgv import denoise
 from vitamin3d.dense.photometric_check import marked, photometrically_checked
 from vitamin3d.dense.surface_extraction import clean
 from vitamin3d.dense.tsdf_fusion import Limits, TsdfVolume, empty_surface
-from vitamin3d.dense.view_selection import ViewSelection
+from vitamin3d.dense.view_selection import ViewSelection, view_stride
 from vitamin3d.dense.view_store import Packed, ViewStore, packed
 from vitamin3d.geometry.camera import Camera
 from vitamin3d.geometry.se3 import inverse
@@ -42,16 +42,19 @@ class Reconstruction:
         config: its dense groups are used.
         times: grows by the milliseconds of each step.
         keeps_views: fused views are kept, so that `fuse_again` can move them; where the settings and the volume allow it.
+        num_keyframes: that will come, all of a finished map; 0: they come while the camera is tracked.
     """
 
-    def __init__(self, camera: Camera, config: Config, times: StepTimes | None = None, keeps_views: bool = False) -> None:
+    def __init__(
+        self, camera: Camera, config: Config, times: StepTimes | None = None, keeps_views: bool = False, num_keyframes: int = 0
+    ) -> None:
         self.config = config
         self.times = times if times is not None else StepTimes()
         self.renderer = DepthRenderer(camera, config.depth_rendering)
         self._border = outline(camera, config.extrapolation.spacing_px)
         densification = config.densification
         self._densifier = Densifier(camera, self.renderer.canvas, densification)
-        selection = ViewSelection(camera, densification.keyframe_stride, densification.view_motion_px)
+        selection = ViewSelection(camera, view_stride(num_keyframes, densification), densification.view_motion_px)
         self._keyframes: NeighbourQueue[CanvasPicture] = NeighbourQueue(densification.reach, lambda p: selection.is_view(p.snapshot))
         self._drawn: NeighbourQueue[DepthView] = NeighbourQueue(config.consistency.reach if self._is_checked else 0)
         self.median_depths: list[float] = []

@@ -5,7 +5,8 @@ import numpy as np
 import pytest
 from scenes import PINHOLE
 
-from vitamin3d.dense.view_selection import ViewSelection
+from vitamin3d.config import DensificationConfig
+from vitamin3d.dense.view_selection import ViewSelection, view_stride
 from vitamin3d.geometry.se3 import exp_se3
 from vitamin3d.types import Frame, MapSnapshot
 
@@ -56,3 +57,8 @@ def test_after_a_turn_that_leaves_all_behind_there_is_a_view():
 def test_after_a_view_without_landmarks_the_next_keyframe_is_one():
     selection = ViewSelection(PINHOLE, 9, 100.0)
     assert selection.is_view(snapshot(0.0, 0)) and selection.is_view(snapshot(1.0)) and not selection.is_view(snapshot(2.0))
+
+
+def test_long_recordings_get_larger_strides_but_not_too_large_ones():
+    config = DensificationConfig(keyframe_stride=2, max_views=80, max_stride=5)
+    assert [view_stride(count, config) for count in (0, 10, 239, 240, 399, 400, 5000)] == [2, 2, 2, 3, 4, 5, 5]

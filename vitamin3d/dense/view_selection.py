@@ -3,9 +3,19 @@
 
 import numpy as np
 
+from vitamin3d.config import DensificationConfig
 from vitamin3d.geometry.camera import Camera
 from vitamin3d.geometry.se3 import inverse, transform_points
 from vitamin3d.types import Array, MapSnapshot
+
+
+def view_stride(num_keyframes: int, config: DensificationConfig) -> int:
+    """Of how many keyframes one becomes a view: a short recording's are dearer than those of a long one, where many see each place.
+
+    Args:
+        num_keyframes: of the finished map; 0 where they come while the camera is tracked.
+    """
+    return max(config.keyframe_stride, min(config.max_stride, num_keyframes // config.max_views))
 
 
 class ViewSelection:
