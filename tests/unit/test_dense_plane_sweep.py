@@ -6,6 +6,7 @@ import reference_dense as reference
 from vitamin3d.config import DensificationConfig
 from vitamin3d.dense import plane_sweep
 from vitamin3d.dense.plane_sweep import PlaneSweep, census, turned
+from vitamin3d.errors import InputError
 from vitamin3d.geometry.camera import Camera
 from vitamin3d.geometry.se3 import exp_se3
 
@@ -75,15 +76,21 @@ def test_a_wall_is_found_and_is_distinct(inverse_depth):
     image, right, left = shifted_scene(CAMERA.fx * baseline, inverse_depth)
     motions = np.array([[-baseline, 0, 0], [baseline, 0, 0]])
     exact = round(CAMERA.fx * baseline * inverse_depth) / (CAMERA.fx * baseline)
-    swept = PlaneSweep(CAMERA, DensificationConfig()).depths(image, [right, left], motions, np.linspace(0.1, 1.0, 64))
+    swept = PlaneSweep(CAMERA, DensificationConfig(planes=64)).depths(image, [right, left], motions, np.linspace(0.1, 1.0, 64))
     inside = np.s_[10:-10, 30:-30]
     assert np.median(np.abs(swept.inverse_depth[inside] - exact)) < 0.05
     assert np.median(swept.distinctness[inside]) > 1.5 and np.median(swept.cost[inside]) < 1.0
 
 
+def test_a_sweep_takes_as_many_planes_as_it_has_memory_for():
+    flat = np.full((CAMERA.height, CAMERA.width), 90, np.uint8)
+    with pytest.raises(InputError, match="64 planes for a sweep of 48"):
+        PlaneSweep(CAMERA, DensificationConfig(planes=48)).depths(flat, [flat], 0.1 * np.eye(3)[:1], np.linspace(0.1, 1.0, 64))
+
+
 def test_without_texture_nothing_is_distinct():
     flat = np.full((CAMERA.height, CAMERA.width), 90, np.uint8)
-    swept = PlaneSweep(CAMERA, DensificationConfig()).depths(flat, [flat, flat], 0.1 * np.eye(3)[:2], np.linspace(0.1, 1.0, 64))
+    swept = PlaneSweep(CAMERA, DensificationConfig(planes=64)).depths(flat, [flat, flat], 0.1 * np.eye(3)[:2], np.linspace(0.1, 1.0, 64))
     assert swept.distinctness[20:-20, 20:-20].max() < 1.01
 
 

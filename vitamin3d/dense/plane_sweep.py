@@ -13,6 +13,7 @@ import numpy as np
 from vitamin3d._jit import inlined, kernel
 from vitamin3d._lanes import WIDE, counting_shorts, least, lesser, load_shorts, shorts, store, where_below
 from vitamin3d.config import DensificationConfig
+from vitamin3d.errors import InputError
 from vitamin3d.geometry.camera import Camera
 from vitamin3d.types import Array
 
@@ -238,8 +239,13 @@ class PlaneSweep:
             image: (H, W) uint8, 0 = no picture.
             sources: pictures of the neighbours, turned into the orientation of this one (`turned`).
             motions: (S, 3), X_source = X + motion in that orientation.
-            inverse_depths: (D,) planes, evenly spaced.
+            inverse_depths: (D,) planes, evenly spaced, as many as the settings say.
+
+        Raises:
+            InputError: as many they are not.
         """
+        if len(inverse_depths) != self.config.planes:
+            raise InputError(f"{len(inverse_depths)} planes for a sweep of {self.config.planes} (densification.planes)")
         columns, rows = self._places(motions, inverse_depths)
         signatures = np.stack([np.pad(census(source), ((0, 1), (0, 1))) for source in sources])
         _sweep(census(image), signatures, columns, rows, self._cost)
