@@ -498,10 +498,10 @@ class FusionConfig:
     voxel_high: float | None = None
     depth_per_voxel_low: float = 20.0
     depth_per_voxel_high: float = 120.0
-    keyframes_for_depth: int = 12
-    """Keyframes whose depths decide the voxels; fusion waits for them where the voxels are not given."""
+    keyframes_for_depth: int = 20
+    """Views whose depths decide the voxels; fusion waits for them where the voxels are not given."""
     truncation_voxels: float = 3.0
-    max_relative_deviation: float = 0.05
+    max_relative_deviation: float = 0.055
     """Pixels whose depth has a larger deviation, relative to the depth, are not fused (not of `blocks`)."""
     max_deviation_voxels: float = 4.5
     """The surface ends where all views together leave a larger deviation of the depth (`blocks` alone)."""
