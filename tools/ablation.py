@@ -46,7 +46,7 @@ INGREDIENTS: tuple[tuple[str, str, Any], ...] = (
     ("anchors", "window.anchors", 0),
     ("long windows", "window.keyframes", 8),
     ("choice of long tracks in windows", "bundle_adjustment.points_per_keyframe", 0),
-    ("adjustment at every frame", "bundle_adjustment.sweeps_per_frame", 0),
+    ("frames that are localised only", "bundle_adjustment.sweeps_per_frame", 2),
     ("Schur complement", "bundle_adjustment.keyframe_solver", "subspace"),
     ("motion prior before RANSAC", "localization.prior_inlier_ratio", 2.0),
     ("more than 2000 tracks", "extrema.max_tracks", 2000),

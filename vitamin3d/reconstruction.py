@@ -193,12 +193,15 @@ class Reconstruction:
         self._fuse_waiting()
         return self.surfaces_so_far()
 
-    def surfaces_so_far(self) -> tuple[Surface, Surface]:
-        """The coarse and the fine surface of the keyframes that are fused; empty while the voxels are not chosen yet."""
+    def surfaces_so_far(self, colored: bool = True) -> tuple[Surface, Surface]:
+        """The coarse and the fine surface of the keyframes that are fused; empty while the voxels are not chosen yet.
+
+        To look at in the course of a run they come sooner without colours (`TsdfVolume.extract_surface`).
+        """
         with self.times.timed("surface_low"):
-            low = self._surface(self.low)
+            low = self._surface(self.low, colored)
         with self.times.timed("surface_high"):
-            high = self._surface(self.high)
+            high = self._surface(self.high, colored)
         return low, high
 
     @property
@@ -273,9 +276,9 @@ class Reconstruction:
         limits = Limits(fusion.max_relative_deviation, fusion.max_deviation_voxels * voxel_length)
         return TsdfVolume(voxel_length, fusion.truncation_voxels * voxel_length, limits, fusion.backend)
 
-    def _surface(self, volume: TsdfVolume | None) -> Surface:
+    def _surface(self, volume: TsdfVolume | None, colored: bool) -> Surface:
         if volume is None or self.high is None:
             return empty_surface()
         coarser = volume.voxel_length / self.high.voxel_length
         least = round(self.config.surface.min_component_triangles / coarser**2)
-        return clean(volume.extract_surface(), replace(self.config.surface, min_component_triangles=least))
+        return clean(volume.extract_surface(colored), replace(self.config.surface, min_component_triangles=least))

@@ -97,3 +97,4 @@ def _reconstructed(slam: Slam, frames: list[Frame], config: Config) -> None:
                 counts_from_depth(view.depth, 1000.0)
                 rgb_from_normals(view.normals_cam)
         reconstruction.surfaces()
+        reconstruction.surfaces_so_far(colored=False)

@@ -100,7 +100,9 @@ def test_statistics_tell_what_happened(demo_run: Path) -> None:
     given = open_dataset(DEMO).camera
     assert read_calibration(demo_run / "calibration.yaml").camera == given
     assert stats["unit"] == "metre" and stats["voxels"]["high"] == pytest.approx(0.025)
-    assert {"curvature_extrema", "track_extrema", "localize", "bundle_adjustment_keyframe", "denoising", "fusion_high"} <= set(stats["steps"])
+    assert {"curvature_extrema", "track_extrema", "localize", "bundle_adjustment_keyframe", "denoising", "fusion_high"} <= set(
+        stats["steps"]
+    )
     assert stats["wall_seconds"] > 0 and stats["cpu_seconds"] > 0 and stats["peak_memory_mb"] > 100
 
 

@@ -9,7 +9,7 @@ from vitamin3d.config import CalibrationConfig
 from vitamin3d.geometry.reprojection import reprojection_errors
 from vitamin3d.mapping.calibration_refinement import CalibrationRefinement
 
-CONFIG = CalibrationConfig(first_keyframes=5, points_per_keyframe=60, systematic_factor=3.0)
+CONFIG = CalibrationConfig(growth=2.0, first_keyframes=5, points_per_keyframe=60, systematic_factor=3.0)
 
 
 def map_seen_through(true, wrong, rng, noise_px=0.2):

@@ -120,14 +120,30 @@ def test_extrinsics_are_camera_from_world(backend):
     assert np.quantile(np.abs(points_cam[:, 2] - 1.5), 0.95) < 0.2 * VOXEL
 
 
+def test_without_colours_the_surface_is_the_same_but_for_its_steps():
+    """Each corner is one of Open3D's; only cubes with a voxel that is farther than 0.98 of the truncation are left open."""
+    poses = ((0, 0, 0), (0.2, 0, 0), (0, -0.2, 0.1))
+    volume = TsdfVolume(VOXEL, 4 * VOXEL, LIMITS, "scalable")
+    for x, y, z in poses:
+        volume.integrate(view_of_sphere(inverse(exp_se3(np.array([x, y, z, 0.2 * y, -0.2 * x, 0.05]))), 1.0), CAMERA, 5.0)
+    colored, grey = volume.extract_surface(), volume.extract_surface(colored=False)
+    tree = cKDTree(colored.vertices_world)
+    assert tree.query(grey.vertices_world)[0].max() < 1e-9
+    assert 0.9 * len(colored.triangles) < len(grey.triangles) <= len(colored.triangles)
+    assert len(np.unique(grey.colors)) == 1
+    corners = grey.vertices_world[grey.triangles]
+    normals = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
+    assert ((normals * corners.mean(axis=1)).sum(axis=1) < 0).mean() > 0.99  # they face the cameras near the origin
+
+
 @pytest.mark.parametrize("backend", list(BACKENDS))
 def test_an_empty_volume_has_an_empty_surface(backend):
     volume = TsdfVolume(VOXEL, 4 * VOXEL, LIMITS, backend)
     nothing = np.zeros((CAMERA.height, CAMERA.width, 3), np.uint8)
     zeros = nothing[..., 0].astype(np.float32)
     volume.integrate(DepthView(0, np.eye(4), zeros, nothing.astype(np.float32), nothing, zeros), CAMERA, 2.0)
-    surface = volume.extract_surface()
-    assert surface.vertices_world.shape == (0, 3) and surface.triangles.shape == (0, 3)
+    for surface in (volume.extract_surface(), volume.extract_surface(colored=False)):
+        assert surface.vertices_world.shape == (0, 3) and surface.triangles.shape == (0, 3)
 
 
 def test_an_open3d_that_fuses_nothing_is_refused(monkeypatch):
@@ -136,7 +152,7 @@ def test_an_open3d_that_fuses_nothing_is_refused(monkeypatch):
 
         def integrate(self, view, canvas, max_depth): ...
 
-        def extract_surface(self):
+        def extract_surface(self, colored):
             return empty_surface()
 
     monkeypatch.setitem(tsdf_fusion.BACKENDS, "dead", Dead)

@@ -19,7 +19,7 @@ RAY_STRIDE = 3
 
 
 @inlined
-def _key(x, y, z):  # type: ignore[no-untyped-def]
+def key_of(x, y, z):  # type: ignore[no-untyped-def]
     return ((x + KEY_OFFSET) << (2 * KEY_BITS)) | ((y + KEY_OFFSET) << KEY_BITS) | (z + KEY_OFFSET)
 
 
@@ -41,13 +41,33 @@ def _rehash(old, new):  # type: ignore[no-untyped-def]
             new[at, 0], new[at, 1] = old[i, 0], old[i, 1]
 
 
+@inlined
+def block_at(table, key, x, y, z, keys, count):  # type: ignore[no-untyped-def]
+    """The number of the block (x, y, z) with this key, a new one if there is none yet, and how many there are; `EMPTY`: full."""
+    at = _slot(table, key)
+    if table[at, 0] == EMPTY:
+        if count >= keys.shape[0]:
+            return EMPTY, count
+        table[at, 0], table[at, 1] = key, count
+        keys[count, 0], keys[count, 1], keys[count, 2] = x, y, z
+        count += 1
+    return table[at, 1], count
+
+
 @kernel
-def _find_near(table, keys, near):  # type: ignore[no-untyped-def]
+def _fill_near(table, keys, near):  # type: ignore[no-untyped-def]
     """Rows (N, 8) of the blocks at a block's key and one further along x, y, z (bits of the column), -1 where there is none."""
     for b in range(keys.shape[0]):
         for k in range(8):
-            at = _slot(table, _key(keys[b, 0] + (k & 1), keys[b, 1] + (k >> 1 & 1), keys[b, 2] + (k >> 2)))
+            at = _slot(table, key_of(keys[b, 0] + (k & 1), keys[b, 1] + (k >> 1 & 1), keys[b, 2] + (k >> 2)))
             near[b, k] = table[at, 1]
+
+
+def find_near(table: Array, keys: Array) -> Array:
+    """`Blocks.near` (N, 8) of blocks with keys (N, 3) in the hash table."""
+    near = np.empty((len(keys), 8), np.int64)
+    _fill_near(table, keys, near)
+    return near
 
 
 @inlined
@@ -79,18 +99,13 @@ def _touch(depth, intrinsics, T_world_cam, block, reach, max_depth, stride, tabl
                     _place(T_world_cam, 1, x, y, d, block),
                     _place(T_world_cam, 2, x, y, d, block),
                 )
-                key = _key(bx, by, bz)
+                key = key_of(bx, by, bz)
                 if key == before[k]:
                     continue
                 before[k] = key
-                at = _slot(table, key)
-                if table[at, 0] == EMPTY:
-                    if count >= keys.shape[0]:
-                        return -1, found
-                    table[at, 0], table[at, 1] = key, count
-                    keys[count, 0], keys[count, 1], keys[count, 2] = bx, by, bz
-                    count += 1
-                b = table[at, 1]
+                b, count = block_at(table, key, bx, by, bz, keys, count)
+                if b == EMPTY:
+                    return -1, found
                 if stamps[b] != stamp:
                     stamps[b] = stamp
                     touched[found] = b
@@ -228,8 +243,7 @@ class BlockVolume:
     def extract(self) -> tuple[Array, Array, Array]:
         """Vertices (V, 3), triangles (F, 3) and colours (V, 3) in 0–1 of the zero level, in an order that depends on the values alone."""
         n = self.num_blocks
-        near = np.empty((n, 8), np.int64)
-        _find_near(self._table, self._keys[:n], near)
+        near = find_near(self._table, self._keys[:n])
         blocks = Blocks(self._keys[:n], near, self._distance[:n], self._weight[:n], self._shade[:n])
         vertices, triangles, colors = zero_level(blocks, self.min_weight, self.voxel_length)
         return vertices, triangles, colors / np.float32(255.0)
