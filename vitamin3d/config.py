@@ -243,7 +243,7 @@ class BundleAdjustmentConfig:
 
 @dataclass(frozen=True)
 class FinalAdjustmentConfig:
-    """The adjustment of the whole map at the end: a round as in the windows, and a stricter one; outliers removed after each."""
+    """The adjustment of the whole map at the end, with all observations and stricter than the windows'; then its outliers go."""
 
     enabled: bool = True
     sigma_px: float = 1.0

@@ -2,11 +2,10 @@
 """Tracking, localisation and mapping on one page (Fig. 2a–b of the paper): `Slam.process_frame`, top to bottom."""
 
 from dataclasses import replace
-from functools import partial
 
 import numpy as np
 
-from vitamin3d.bundle_adjustment.adjust import adjust_bundle, adjust_by_long_tracks
+from vitamin3d.bundle_adjustment.adjust import adjust_bundle
 from vitamin3d.bundle_adjustment.marginalization import CameraPrior
 from vitamin3d.bundle_adjustment.problem import BundleProblem
 from vitamin3d.bundle_adjustment.schur import adjust_accelerated
@@ -381,23 +380,17 @@ class Slam:
 
     def finish(self) -> None:
         """The adjustment of the whole map at the end of a recording; the poses of all frames move along."""
-        window_round, final = self.config.bundle_adjustment, self.config.final_adjustment
+        final = self.config.final_adjustment
         if not final.enabled or not 2 < self.map.num_keyframes <= final.max_keyframes:
             return
         if self.calibration.is_enabled:
             self._refine_calibration()
         with self.times.timed("final_adjustment"):
-            self._adjust_whole_map(window_round.sigma_px, window_round.outlier_px, window_round.points_per_keyframe)
-            self._adjust_whole_map(final.sigma_px, final.outlier_px, per_keyframe=0)
-
-    def _adjust_whole_map(self, sigma_px: float, outlier_px: float, per_keyframe: int) -> None:
-        final, everything = self.config.final_adjustment, whole_map(self.map)
-        solver = partial(
-            adjust_accelerated, camera=self.camera, sigma_px=sigma_px, iterations=final.iterations, relative_gain=final.relative_gain
-        )
-        solved, _ = adjust_by_long_tracks(build_problem(self.map, everything), self.camera, sigma_px, per_keyframe, solver)
-        store_solution(self.map, everything, solved)
-        self._remove_outliers(everything, solved, outlier_px)
+            everything = whole_map(self.map)
+            problem = build_problem(self.map, everything)
+            solved, _ = adjust_accelerated(problem, self.camera, final.sigma_px, final.iterations, final.relative_gain)
+            store_solution(self.map, everything, solved)
+            self._remove_outliers(everything, solved, final.outlier_px)
 
     # --- what leaves ---------------------------------------------------------------------------------------------
 

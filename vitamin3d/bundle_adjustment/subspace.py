@@ -44,6 +44,7 @@ from vitamin3d.bundle_adjustment.observations import (
 from vitamin3d.bundle_adjustment.problem import BundleProblem
 from vitamin3d.bundle_adjustment.variables import Progress, Variables, free_slots, pinhole_model, sightings_of, squared_errors_of
 from vitamin3d.geometry.camera import Camera
+from vitamin3d.geometry.cholesky import solve_6x6
 from vitamin3d.geometry.reprojection import in_camera, linearize_lanes, model_of, points_of, pose_of, retract
 from vitamin3d.types import Array, BundleReport
 
@@ -74,33 +75,6 @@ class Scratch(NamedTuple):
 def new_scratch() -> Scratch:
     """Memory for the sweeps."""
     return Scratch(*(np.empty(shape) for shape in (27, (1, 6, 6), 6, 6, (1, 3, 3), (1, 3))))
-
-
-@kernel
-def solve_6x6(H, g, delta):  # type: ignore[no-untyped-def]
-    """delta = -H⁻¹ g by Cholesky, H (1, 6, 6) given by its upper triangle and spoilt; False where it is not positive."""
-    for i in range(6):
-        for j in range(i, 6):
-            total = H[0, i, j]
-            for k in range(i):
-                total -= H[0, k, i] * H[0, k, j]
-            if i == j:
-                if not total > 0.0:
-                    return False
-                H[0, i, i] = np.sqrt(total)
-            else:
-                H[0, i, j] = total / H[0, i, i]
-    for i in range(6):
-        total = -g[i]
-        for k in range(i):
-            total -= H[0, k, i] * delta[k]
-        delta[i] = total / H[0, i, i]
-    for i in range(5, -1, -1):
-        total = delta[i]
-        for k in range(i + 1, 6):
-            total -= H[0, i, k] * delta[k]
-        delta[i] = total / H[0, i, i]
-    return True
 
 
 @kernel

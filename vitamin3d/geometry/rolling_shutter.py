@@ -11,7 +11,9 @@ from dataclasses import replace
 import cv2
 import numpy as np
 
+from vitamin3d._jit import kernel
 from vitamin3d.geometry.camera import Camera
+from vitamin3d.geometry.cholesky import solve_6x6
 from vitamin3d.types import Array, Frame
 
 TERMS = 6
@@ -30,6 +32,41 @@ def _terms(pixels: Array, camera: Camera) -> Array:
     return np.stack([np.ones_like(x), x, y, x * x, x * y, y * y], axis=-1)
 
 
+@kernel
+def _fit(terms, motion, coefficients):  # type: ignore[no-untyped-def]
+    """Fills `coefficients` (6, 2); False where the terms (N, 6) do not determine them."""
+    weights, squared = np.ones(len(motion)), np.empty(len(motion))
+    H, damped, g, delta = np.empty((1, TERMS, TERMS)), np.empty((1, TERMS, TERMS)), np.empty((2, TERMS)), np.empty(TERMS)
+    for _ in range(FIT_ITERATIONS):
+        H[:] = 0.0
+        g[:] = 0.0
+        for n in range(motion.shape[0]):
+            for i in range(TERMS):
+                weighted = weights[n] * terms[n, i]
+                for c in range(2):
+                    g[c, i] -= weighted * motion[n, c]
+                for j in range(i, TERMS):
+                    H[0, i, j] += weighted * terms[n, j]
+        for i in range(TERMS):
+            H[0, i, i] += 1e-9
+        for c in range(2):
+            damped[:] = H
+            if not solve_6x6(damped, g[c], delta):
+                return False
+            coefficients[:, c] = delta
+        for n in range(motion.shape[0]):
+            squared[n] = 0.0
+            for c in range(2):
+                rest = motion[n, c]
+                for i in range(TERMS):
+                    rest -= terms[n, i] * coefficients[i, c]
+                squared[n] += rest * rest
+        scale = max(LEAST_SCALE_PX**2, np.median(squared))
+        for n in range(motion.shape[0]):
+            weights[n] = (scale / (squared[n] + scale)) ** 2
+    return True
+
+
 def fit_image_motion(previous: Array, current: Array, seconds: float, camera: Camera) -> Array:
     """Coefficients (6, 2) of the image's velocity, distorted pixels per second, by Gauss–Newton with Geman–McClure weights.
 
@@ -39,18 +76,10 @@ def fit_image_motion(previous: Array, current: Array, seconds: float, camera: Ca
         seconds: the while; where it is not positive, or with fewer than 60 pairs, the motion is taken as none.
     """
     sample = slice(None, None, max(1, len(previous) // MOST_SAMPLES))
-    motion = current[sample] - previous[sample]
+    motion, coefficients = current[sample] - previous[sample], np.zeros((TERMS, 2))
     if seconds <= 0 or len(motion) < 10 * TERMS:
         return NO_MOTION
-    terms, weights = _terms(current[sample], camera), np.ones(len(motion))
-    coefficients = NO_MOTION
-    for _ in range(FIT_ITERATIONS):
-        normal = terms.T @ (terms * weights[:, None]) + 1e-9 * np.eye(TERMS)
-        coefficients = np.linalg.solve(normal, terms.T @ (motion * weights[:, None]))
-        squared = ((motion - terms @ coefficients) ** 2).sum(axis=1)
-        scale = max(LEAST_SCALE_PX**2, float(np.median(squared)))
-        weights = (scale / (squared + scale)) ** 2
-    return np.asarray(coefficients / seconds)
+    return coefficients / seconds if _fit(_terms(current[sample], camera), motion, coefficients) else NO_MOTION
 
 
 def row_shift(measured: Array, motion: Array, camera: Camera) -> Array:

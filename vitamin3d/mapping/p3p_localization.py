@@ -7,10 +7,11 @@ from vitamin3d._jit import inlined, kernel
 from vitamin3d._lanes import WIDTH, counting, gather, lanes, select, total
 from vitamin3d.bundle_adjustment.normal_equations import add_camera, no_camera, write_camera
 from vitamin3d.bundle_adjustment.observations import information, robust_cost
-from vitamin3d.bundle_adjustment.subspace import new_scratch, solve_6x6
+from vitamin3d.bundle_adjustment.subspace import new_scratch
 from vitamin3d.bundle_adjustment.variables import pinhole_model
 from vitamin3d.config import LocalizationConfig
 from vitamin3d.geometry.camera import Camera
+from vitamin3d.geometry.cholesky import solve_6x6
 from vitamin3d.geometry.p3p import p3p_ransac
 from vitamin3d.geometry.reprojection import (
     in_camera,
