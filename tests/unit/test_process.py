@@ -27,3 +27,17 @@ def faults(call):
 @pytest.mark.skipif(sys.platform != "linux", reason="glibc alone is told to keep memory")
 def test_freed_memory_is_kept():
     assert faults("keep_freed_memory()") < 50 < 1000 < faults("")
+
+
+def test_open3d_comes_without_its_machine_learning():
+    script = """
+import sys
+from vitamin3d.commands.process import skip_machine_learning
+skip_machine_learning()
+from vitamin3d.dense.tsdf_fusion import BACKENDS, check_backend
+for backend in BACKENDS:
+    check_backend(backend)
+print("sklearn" in sys.modules)
+"""
+    done = subprocess.run([sys.executable, "-c", script], capture_output=True, text=True, check=True, timeout=120)
+    assert done.stdout.split() == ["False"]

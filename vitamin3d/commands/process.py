@@ -4,6 +4,7 @@
 import ctypes
 import os
 import sys
+from types import ModuleType
 
 EXIT_BROKEN, EXIT_ERROR, EXIT_NO_MAP, EXIT_INTERRUPTED = 1, 2, 3, 130
 ONE_THREAD_EACH = ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS")
@@ -26,3 +27,9 @@ def keep_freed_memory() -> None:
     if mallopt is not None:
         mallopt(M_MMAP_THRESHOLD, KEPT_BLOCK_BYTES)
         mallopt(M_TRIM_THRESHOLD, KEPT_BYTES)
+
+
+def skip_machine_learning() -> None:
+    """Open3D's import brings its machine-learning data sets along, and with them scikit-learn and pandas: half of its two seconds.
+    The command line needs none of them. Before Open3D loads."""
+    sys.modules.setdefault("open3d.ml", ModuleType("open3d.ml"))

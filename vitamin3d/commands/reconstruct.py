@@ -7,7 +7,14 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from vitamin3d.commands.process import EXIT_BROKEN, EXIT_INTERRUPTED, EXIT_NO_MAP, keep_freed_memory, one_thread_each
+from vitamin3d.commands.process import (
+    EXIT_BROKEN,
+    EXIT_INTERRUPTED,
+    EXIT_NO_MAP,
+    keep_freed_memory,
+    one_thread_each,
+    skip_machine_learning,
+)
 from vitamin3d.errors import InputError
 
 if TYPE_CHECKING:
@@ -57,6 +64,7 @@ def reconstruct(
     """Reconstruct a sequence: trajectory, cloud, meshes, depth and normal maps."""
     one_thread_each()
     keep_freed_memory()
+    skip_machine_learning()
     from vitamin3d.job import Job, Selection
 
     voxels = _voxels(voxel_low, voxel_high, metric_scale, scale_from_ground_truth)
