@@ -322,7 +322,7 @@ class SnapshotConfig:
 
     min_observations: int = 3
     min_observation_sigma_px: float = 0.1
-    shared_error: float = 0.65
+    shared_error: float = 0.55
     """What a landmark's observations have in common does not average out: the variance of a residual times 1 + this × their number."""
     max_relative_deviation: float = 0.5
     max_reprojection_rms_px: float = 1.5
