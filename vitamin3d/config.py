@@ -592,8 +592,8 @@ def paper_config() -> Config:
 def live_config(base: Config) -> Config:
     """`base` for cameras that do not wait: fewer keyframes, and meshes made soon after their pictures.
 
-    Nothing is adjusted again at the end: the mesh is there already. The volume is ours, since Open3D's lets no other thread run
-    while it integrates a view.
+    Nothing is adjusted again at the end: the mesh is there already; so windows are adjusted sooner, with more points. The volume is
+    ours, since Open3D's lets no other thread run while it integrates a view.
     """
     change = dataclasses.replace
     return change(
@@ -601,7 +601,12 @@ def live_config(base: Config) -> Config:
         extrema=change(base.extrema, max_tracks=min(5600, base.extrema.max_tracks)),
         keyframes=change(base.keyframes, motion_px=20.0),
         window=change(base.window, settled_keyframes=2, settled_frames=10),
-        bundle_adjustment=change(base.bundle_adjustment, sweeps_per_frame=0),
+        bundle_adjustment=change(
+            base.bundle_adjustment,
+            sweeps_per_frame=0,
+            keyframe_interval=min(3, base.bundle_adjustment.keyframe_interval),
+            points_per_keyframe=400 if base.bundle_adjustment.points_per_keyframe else 0,
+        ),
         final_adjustment=change(base.final_adjustment, enabled=False),
         calibration=change(base.calibration, refine="off"),
         memory=change(base.memory, max_keyframes=600, max_new_tracks=60_000),
