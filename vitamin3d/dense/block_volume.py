@@ -20,6 +20,7 @@ RAY_STRIDE = 3
 
 @inlined
 def key_of(x, y, z):  # type: ignore[no-untyped-def]
+    """One number for the block (x, y, z)."""
     return ((x + KEY_OFFSET) << (2 * KEY_BITS)) | ((y + KEY_OFFSET) << KEY_BITS) | (z + KEY_OFFSET)
 
 
