@@ -222,7 +222,7 @@ class BundleAdjustmentConfig:
     sigma_px: float = 2.0
     sweeps_per_frame: int = 0
     """Subspace Gauss–Newton sweeps over the newest keyframes and the frame's landmarks, at every frame (Eq. 11–12). Where frames are
-    localised by thousands of landmarks they gain nothing more (docs/bundle_adjustment.md)."""
+    localised by thousands of landmarks they gain little (docs/bundle_adjustment.md)."""
     keyframe_solver: str = "subspace-accelerated"
     """Solver of the window at each keyframe: `subspace-accelerated` (cameras together with the points eliminated, then each
     point alone), `schur` (the former only), `subspace` (Eq. 11–12) or `subspace-inner` (several sweeps with the same derivatives)."""

@@ -94,11 +94,17 @@ def models_are_distorted(models):  # type: ignore[no-untyped-def]
 
 
 @inlined
-def camera_rows(obs_point, pixels, points, i, last):  # type: ignore[no-untyped-def]
-    """Observations i.. of a camera whose last is `last` - 1: rows, whether they are there, their points and pixels."""
+def rows_from(i, last):  # type: ignore[no-untyped-def]
+    """Rows i.. of which `last` - 1 is the last, the first repeated behind it; and which are no repetition."""
     rows = counting(i)
     is_there = rows < last
-    rows = select(is_there, rows, i)
+    return select(is_there, rows, i), is_there
+
+
+@inlined
+def camera_rows(obs_point, pixels, points, i, last):  # type: ignore[no-untyped-def]
+    """Observations i.. of a camera whose last is `last` - 1: rows, whether they are there, their points and pixels."""
+    rows, is_there = rows_from(i, last)
     X, Y, Z = points_of(points, gather(obs_point, rows))
     return rows, is_there, X, Y, Z, gather(pixels, 2 * rows), gather(pixels, 2 * rows + 1)
 

@@ -6,11 +6,9 @@ from typing import Any
 import numpy as np
 
 from vitamin3d._jit import kernel
-from vitamin3d.dense.block_volume import block_at, find_near, key_of
+from vitamin3d.dense.block_volume import FIRST_BLOCKS, block_at, find_near, key_of
 from vitamin3d.dense.marching_cubes import EMPTY, SIDE, VOXELS, Blocks, zero_level
 from vitamin3d.types import Array
-
-FIRST_BLOCKS = 1 << 13
 
 
 @kernel

@@ -4,9 +4,9 @@
 import numpy as np
 
 from vitamin3d._jit import inlined, kernel
-from vitamin3d._lanes import WIDTH, counting, gather, lanes, select, total
+from vitamin3d._lanes import WIDTH, gather, lanes, total
 from vitamin3d.bundle_adjustment.normal_equations import add_camera, no_camera, write_camera
-from vitamin3d.bundle_adjustment.observations import information, robust_cost
+from vitamin3d.bundle_adjustment.observations import information, robust_cost, rows_from
 from vitamin3d.bundle_adjustment.subspace import new_scratch
 from vitamin3d.bundle_adjustment.variables import pinhole_model
 from vitamin3d.config import LocalizationConfig
@@ -32,9 +32,7 @@ ROUGH_GAIN = 1e-2
 @inlined
 def _rows(points, pixels, pose, i):  # type: ignore[no-untyped-def]
     """Eight correspondences from the i-th: which of them are there, the points in the camera frame, the pixels."""
-    rows = counting(i)
-    is_there = rows < points.shape[0]
-    rows = select(is_there, rows, i)
+    rows, is_there = rows_from(i, points.shape[0])
     X, Y, Z = points_of(points, rows)
     x, y, z = in_camera(pose, X, Y, Z)
     return is_there, x, y, z, gather(pixels, 2 * rows), gather(pixels, 2 * rows + 1)
@@ -63,7 +61,7 @@ def _normal_equations(models, R, t, points, pixels, inverse_squared_sigma, sums,
 
 @kernel
 def _refine(models, R, t, points, pixels, inverse_squared_sigma, iterations, relative_gain, scratch):  # type: ignore[no-untyped-def]
-    """Levenberg–Marquardt in place on R (1, 3, 3), t (1, 3); the cost never rises. NaN input moves nothing."""
+    """Levenberg–Marquardt in place on R (1, 3, 3), t (1, 3); the cost never rises. With a NaN pose or pixel nothing moves."""
     sums, H, g, delta, R_new, t_new = scratch
     damping, cost = 1e-6, _cost(models, R, t, points, pixels, inverse_squared_sigma)
     for _ in range(iterations):
