@@ -62,6 +62,8 @@ class Job:
     """Keyframes are fused while the camera is tracked; else after the final adjustment of the map. See `live_config`."""
     realtime: bool = False
     """Pictures come when their time stamps say; with `live` and `threads` only."""
+    mesh: bool = True
+    """Else the trajectory and the cloud only: no depth views, no meshes."""
 
 
 @dataclass(frozen=True)
@@ -115,10 +117,10 @@ class _JobRun:
             warm_up([self.job.config])
         source = (self.dataset, self.indices, self.front_end, self.slam)
         if self.job.live and self.job.threads:
-            run_live(*source, self.dense.add_all, self.observer, self.record, self.clock)
+            run_live(*source, self.dense.add_all if self.job.mesh else None, self.observer, self.record, self.clock)
         else:
             run = run_threaded if self.job.threads else run_sequential
-            run(*source, self.dense.add if self.job.live else None, self.observer, self.record)
+            run(*source, self.dense.add if self.job.live and self.job.mesh else None, self.observer, self.record)
         self.dense.finish()
         with step("final adjustment"):
             self.slam.finish()
@@ -128,7 +130,8 @@ class _JobRun:
             self.dense.camera, self.dense.num_keyframes = self.slam.camera, self.slam.map.num_keyframes
             if self.job.scale_from_truth:
                 self.dense.scale = scale_from_ground_truth(self.slam.trajectory(), self.dataset.ground_truth())
-            self.dense.add_all(self._snapshots(), self._keyframe_done)
+            if self.job.mesh:
+                self.dense.add_all(self._snapshots(), self._keyframe_done)
 
     def _snapshots(self) -> Iterator[MapSnapshot]:
         """The keyframes of the finished map, their pictures read again."""
@@ -233,8 +236,8 @@ class _Dense:
         """Of the finished map; 0: they come while the camera is tracked."""
         self.num_moved = 0
         """Views that were fused anew because their keyframe had moved."""
-        self.empty_meshes = ["mesh_low", "mesh_high"]
-        """Names of those without a triangle, which are not written."""
+        self.empty_meshes = ["mesh_low", "mesh_high"] if job.mesh else []
+        """Names of those that were asked for and have no triangle; they are not written."""
         self.mesh_lags: list[float] = []
         """Seconds from when a keyframe's picture was due until it was in the volume; where there is a clock."""
 

@@ -10,7 +10,7 @@ import numpy as np
 from vitamin3d.config import Config
 from vitamin3d.dense.consistency import voted
 from vitamin3d.dense.delaunay import triangulate
-from vitamin3d.dense.densification import CanvasPicture, Densifier, canvas_picture
+from vitamin3d.dense.densification import CanvasPicture, Densifier
 from vitamin3d.dense.depth_rendering import DepthRenderer
 from vitamin3d.dense.extrapolation import extended, outline
 from vitamin3d.dense.neighbour_queue import Around, NeighbourQueue
@@ -24,7 +24,6 @@ from vitamin3d.geometry.camera import Camera
 from vitamin3d.geometry.se3 import inverse
 from vitamin3d.types import Array, DepthView, MapSnapshot, StepTimes, Surface
 
-NO_PICTURE = np.zeros((0, 0), np.uint8)
 NO_NORMALS = np.zeros((0, 0, 3), np.float32)
 """Fusion needs depth and colour; the normals of waiting views are not kept."""
 
@@ -137,9 +136,8 @@ class Reconstruction:
         return done
 
     def _ready(self, snapshot: MapSnapshot) -> list[Around[CanvasPicture]]:
-        if not self.config.densification.enabled:
-            return [Around(CanvasPicture(snapshot, NO_PICTURE, NO_PICTURE), [], [])]
-        return self._keyframes.push(canvas_picture(snapshot, self.renderer.draw_gray(snapshot.frame), self.renderer.is_outside))
+        picture = CanvasPicture(snapshot, self.renderer.draw_gray, self.renderer.is_outside)
+        return self._keyframes.push(picture) if self.config.densification.enabled else [Around(picture, [], [])]
 
     def _densified(self, around: Around[CanvasPicture]) -> MapSnapshot:
         if not self.config.densification.enabled:

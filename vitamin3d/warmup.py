@@ -13,6 +13,7 @@ import numpy as np
 
 from vitamin3d.config import Config, live_config, paper_config
 from vitamin3d.exporters.depth_map import counts_from_depth
+from vitamin3d.exporters.mesh import obj_text
 from vitamin3d.exporters.normal_map import rgb_from_normals
 from vitamin3d.geometry.camera import Camera
 from vitamin3d.mapping.landmark_statistics import point_cloud
@@ -96,5 +97,6 @@ def _reconstructed(slam: Slam, frames: list[Frame], config: Config) -> None:
             for view in reconstruction.add_keyframe(slam.snapshot(keyframe, frames[index])):
                 counts_from_depth(view.depth, 1000.0)
                 rgb_from_normals(view.normals_cam)
-        reconstruction.surfaces()
+        fine = reconstruction.surfaces()[1]
+        b"".join(obj_text(fine, [], ""))
         reconstruction.surfaces_so_far(colored=False)

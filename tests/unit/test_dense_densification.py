@@ -7,7 +7,7 @@ import pytest
 import reference_dense as reference
 
 from vitamin3d.config import Config, DelaunayConfig, DensificationConfig, SurfaceConfig
-from vitamin3d.dense.densification import Densifier, canvas_picture
+from vitamin3d.dense.densification import CanvasPicture, Densifier
 from vitamin3d.dense.neighbour_queue import Around, NeighbourQueue
 from vitamin3d.geometry.camera import Camera
 from vitamin3d.geometry.se3 import exp_se3, inverse
@@ -47,9 +47,13 @@ def picture_of_plane(T_world_cam, landmarks=60, seed=0):
     return snapshot
 
 
+def pictured(snapshot, image=lambda frame: frame.image, is_outside=INSIDE):
+    return CanvasPicture(snapshot, image, is_outside)
+
+
 def scene(count=7, step=0.09):
     poses = [exp_se3(np.array([step * k, -0.02 * k, 0.01 * k, 0.004 * k, -0.006 * k, 0.01 * k])) for k in range(count)]
-    return [canvas_picture(picture_of_plane(T, seed=k), picture_of_plane(T).frame.image, INSIDE) for k, T in enumerate(poses)]
+    return [pictured(picture_of_plane(T, seed=k)) for k, T in enumerate(poses)]
 
 
 def true_depths(snapshot):
@@ -83,12 +87,12 @@ def test_one_vertex_per_cell_at_most():
 
 def test_without_parallax_or_landmarks_the_keyframe_stays_as_it_was():
     pictures = scene(3, step=0.0)
-    still = [dataclasses.replace(p, snapshot=dataclasses.replace(p.snapshot, T_cam_world=np.eye(4))) for p in pictures]
+    still = [pictured(dataclasses.replace(p.snapshot, T_cam_world=np.eye(4))) for p in pictures]
     densifier = Densifier(CAMERA, CAMERA, DensificationConfig())
     assert densifier.densify(Around(still[1], still[:1], still[2:])) is still[1].snapshot
     moving = scene(3)
     assert densifier.densify(Around(moving[1], [], [])) is moving[1].snapshot
-    few = dataclasses.replace(moving[1], snapshot=picture_of_plane(np.eye(4), landmarks=5))
+    few = pictured(picture_of_plane(np.eye(4), landmarks=5))
     assert densifier.densify(Around(few, moving[:1], moving[2:])) is few.snapshot
 
 
@@ -120,10 +124,19 @@ def test_refinement_finds_the_best_patch():
         assert found == pytest.approx(grid[int(np.argmax(scores))], rel=4e-3)
 
 
+def test_only_what_is_compared_is_drawn():
+    drawn = []
+    first, middle, last = (pictured(p.snapshot, lambda frame: drawn.append(frame) or frame.image) for p in scene(3))
+    aside = pictured(middle.snapshot, lambda _: pytest.fail("a neighbour without parallax was drawn"))
+    for _ in range(2):
+        more = Densifier(CAMERA, CAMERA, DensificationConfig()).densify(Around(middle, [aside, first], [last]))
+        assert len(more.pixels) > len(middle.snapshot.pixels) and len(drawn) == 3
+
+
 def test_the_border_of_the_canvas_is_no_picture():
     outside = INSIDE.copy()
     outside[:11, :] = True
-    picture = canvas_picture(picture_of_plane(np.eye(4)), np.zeros(INSIDE.shape, np.uint8), outside)
+    picture = pictured(picture_of_plane(np.eye(4)), lambda _: np.zeros(INSIDE.shape, np.uint8), outside)
     assert (picture.image[:11] == 0).all() and (picture.image[11:] == 1).all()
     assert (picture.reduced[:6] == 0).all() and (picture.reduced[6:] > 0).all()
 
@@ -165,7 +178,7 @@ def test_who_waited_too_long_goes_with_the_neighbours_there_are():
 
 def test_parallax_and_overlap_are_those_of_the_formulas():
     here, there = picture_of_plane(np.eye(4)), picture_of_plane(exp_se3(np.array([0.3, -0.1, 0.05, 0.02, -0.1, 0.03])))
-    one, other = (canvas_picture(s, s.frame.image, INSIDE) for s in (here, there))
+    one, other = (pictured(s) for s in (here, there))
     densifier = Densifier(CAMERA, CAMERA, DensificationConfig())
     points = CAMERA.rays_from_ideal(here.pixels) * here.depths[:, None]
     T = there.T_cam_world @ inverse(here.T_cam_world)

@@ -5,7 +5,7 @@ import reference_dense as reference
 
 from vitamin3d.errors import InputError, OutputError
 from vitamin3d.exporters.depth_map import counts_from_depth, read_depth_map, write_depth_map, write_png
-from vitamin3d.exporters.mesh import read_ply, write_cloud_ply, write_obj, write_ply
+from vitamin3d.exporters.mesh import obj_text, read_ply, write_cloud_ply, write_obj, write_ply
 from vitamin3d.exporters.normal_map import cast_normal_map, rgb_from_normals, write_normal_map
 from vitamin3d.geometry.se3 import exp_se3
 from vitamin3d.types import PointCloud, Surface
@@ -49,6 +49,13 @@ def test_obj_text(surface, tmp_path):
     assert lines[:3] == ["# a comment", "mtllib a.mtl", "v -1 -1 2 0 0.502 1"]
     assert (tmp_path / "a.mtl").read_text().splitlines()[:3] == ["newmtl vertex_colors", "Ka 1 1 1", "Kd 1 1 1"]
     assert lines[6] == "vn 0 0 -1" and lines[-1] == "f 1//1 4//4 3//3"
+
+
+def test_faces_of_an_obj():
+    triangles = np.array([[0, 8, 9], [98, 99, 100], [2147483646, 1234567, 0]], np.int32)
+    mesh = Surface(np.zeros((0, 3)), triangles, np.zeros((0, 3)), np.zeros((0, 3), np.uint8))
+    lines = b"".join(obj_text(mesh, [], "a.mtl")).decode().splitlines()[2:]
+    assert lines == ["f " + " ".join(f"{n + 1}//{n + 1}" for n in row) for row in triangles.tolist()]
 
 
 def test_meshlab_reads_the_colours_of_an_obj(surface, tmp_path):

@@ -7,7 +7,7 @@ import reference_dense as reference
 from scipy.spatial import cKDTree
 
 from vitamin3d.dense import tsdf_fusion
-from vitamin3d.dense.tsdf_fusion import BACKENDS, Limits, TsdfVolume, check_backend, empty_surface
+from vitamin3d.dense.tsdf_fusion import BACKENDS, Limits, TsdfVolume, certain_depth, check_backend, empty_surface
 from vitamin3d.errors import DependencyError, InputError
 from vitamin3d.geometry.se3 import exp_se3, inverse, transform_points
 from vitamin3d.types import DepthView
@@ -98,6 +98,18 @@ def test_what_is_too_uncertain_for_its_depth_is_not_fused(backend):
     volume.integrate(view, CAMERA, 5.0)
     far = volume.extract_surface().vertices_world
     assert len(far) > 500 and far[:, 2].min() > 1.8
+
+
+def test_certain_depth():
+    rng = np.random.default_rng(0)
+    depth, deviations = rng.uniform(0, 4, (20, 30)).astype(np.float32), rng.uniform(0.01, 0.2, (20, 30))
+    depth[:3] = 0.0
+    view = dataclasses.replace(view_of_sphere(np.eye(4)), depth=depth, weights=(deviations**-2).astype(np.float32))
+    expected = [
+        [z if 0 < z < 3.0 and s / z <= 0.05 else 0.0 for z, s in zip(*row, strict=True)] for row in zip(depth, deviations, strict=True)
+    ]
+    np.testing.assert_array_equal(certain_depth(view, 0.05, 3.0), np.array(expected, np.float32))
+    assert 50 < np.count_nonzero(expected) < 500
 
 
 @pytest.mark.parametrize("backend", list(BACKENDS))

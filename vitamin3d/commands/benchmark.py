@@ -7,7 +7,7 @@ from typing import Annotated
 
 import typer
 
-from vitamin3d.commands.process import EXIT_INTERRUPTED, one_thread_each
+from vitamin3d.commands.process import EXIT_INTERRUPTED, prepare
 from vitamin3d.commands.reconstruct import Mode
 
 
@@ -36,7 +36,7 @@ def benchmark(
     keep_all: Annotated[bool, typer.Option("--keep-all", help="Keep depth maps, normal maps and meshes of all trials.")] = False,
 ) -> None:
     """Run all sequences of a data set and print the paper's tables. Started again, it goes on where it was stopped."""
-    one_thread_each()
+    prepare()
     from vitamin3d.benchmark.run import Plan, run_benchmark
 
     options: tuple[str, ...] = ("--mode", mode.value) if mode is not Mode.default else ()

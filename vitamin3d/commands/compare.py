@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from vitamin3d.commands.process import one_thread_each
+from vitamin3d.commands.process import prepare
 from vitamin3d.commands.strays import say_strays
 
 if TYPE_CHECKING:
@@ -37,7 +37,7 @@ def compare(
     json: Annotated[bool, typer.Option("--json", help="Print JSON instead of the table.")] = False,
 ) -> None:
     """Compare with other systems: density, voxels, accuracy, completeness, coverage, and a picture side by side."""
-    one_thread_each()
+    prepare()
     from vitamin3d.evaluation.comparison import compare as compared
     from vitamin3d.evaluation.comparison import read_geometry_as, read_other, read_own
     from vitamin3d.evaluation.comparison_text import markdown, picture

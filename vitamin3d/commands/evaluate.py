@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from vitamin3d.commands.process import one_thread_each
+from vitamin3d.commands.process import prepare
 from vitamin3d.commands.strays import say_strays
 from vitamin3d.errors import InputError
 
@@ -55,7 +55,7 @@ def evaluate(
     json: Annotated[bool, typer.Option("--json", help="Print JSON instead of the table.")] = False,
 ) -> None:
     """Score a trajectory: success rate, ATE, RPE, errors per axis and over time; names the frame and the alignment."""
-    one_thread_each()
+    prepare()
     from vitamin3d.evaluation.evaluation_files import write_evaluation
     from vitamin3d.evaluation.evaluation_text import as_json, table
     from vitamin3d.evaluation.finished_run import TruthRequest, read_run, read_sequence, read_truth

@@ -6,7 +6,7 @@ from typing import Annotated
 
 import typer
 
-from vitamin3d.commands.process import one_thread_each
+from vitamin3d.commands.process import prepare
 from vitamin3d.errors import InputError
 
 SUFFIXES = (".png", ".jpg", ".jpeg")
@@ -29,7 +29,7 @@ def figures(
     out: Annotated[Path | None, typer.Option("--out", "-o", help="PNG or JPEG file; default: RUN/figures.png.")] = None,
 ) -> None:
     """Draw a run as the paper's Fig. 3 does: tracked extrema, points, mesh, and normals at both voxel sizes."""
-    one_thread_each()
+    prepare()
     from vitamin3d.evaluation.finished_run import read_sequence
     from vitamin3d.evaluation.paper_figure import Viewpoint, paper_figure
     from vitamin3d.exporters.depth_map import write_png

@@ -7,10 +7,18 @@ import sys
 from types import ModuleType
 
 EXIT_BROKEN, EXIT_ERROR, EXIT_NO_MAP, EXIT_INTERRUPTED = 1, 2, 3, 130
+UNUSED_PARTS_OF_OPEN3D = ("open3d.ml", "open3d.visualization.draw_plotly")
 ONE_THREAD_EACH = ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS")
 M_TRIM_THRESHOLD, M_MMAP_THRESHOLD = -1, -3
 """Of malloc.h."""
 KEPT_BLOCK_BYTES, KEPT_BYTES = 32 << 20, 256 << 20
+
+
+def prepare() -> None:
+    """What every command begins with, before the libraries load."""
+    one_thread_each()
+    keep_freed_memory()
+    skip_unused_imports()
 
 
 def one_thread_each() -> None:
@@ -29,7 +37,10 @@ def keep_freed_memory() -> None:
         mallopt(M_TRIM_THRESHOLD, KEPT_BYTES)
 
 
-def skip_machine_learning() -> None:
-    """Open3D's import brings its machine-learning data sets along, and with them scikit-learn and pandas: half of its two seconds.
-    The command line needs none of them. Before Open3D loads."""
-    sys.modules.setdefault("open3d.ml", ModuleType("open3d.ml"))
+def skip_unused_imports() -> None:
+    """Open3D's import brings its machine-learning data sets along, with scikit-learn and pandas, and a web server for plots: most of
+    its two seconds. The command line needs none of them. Before Open3D loads."""
+    for name in UNUSED_PARTS_OF_OPEN3D:
+        stand_in = ModuleType(name)
+        stand_in.__dict__["__getattr__"] = lambda attribute: None  # whatever Open3D takes from it
+        sys.modules.setdefault(name, stand_in)

@@ -11,9 +11,7 @@ from vitamin3d.commands.process import (
     EXIT_BROKEN,
     EXIT_INTERRUPTED,
     EXIT_NO_MAP,
-    keep_freed_memory,
-    one_thread_each,
-    skip_machine_learning,
+    prepare,
 )
 from vitamin3d.errors import InputError
 
@@ -57,14 +55,13 @@ def reconstruct(
     scale_from_ground_truth: Annotated[bool, typer.Option("--scale-from-ground-truth", help="Take the scale from it.")] = False,
     live: Annotated[bool, typer.Option("--live", help="Fuse while tracking; keyframes there is no time for are not meshed.")] = False,
     realtime: Annotated[bool, typer.Option("--realtime", help="--live, and pictures come when their time stamps say.")] = False,
+    mesh: Annotated[bool, typer.Option("--mesh/--no-mesh", help="Meshes, depth and normal maps; or trajectory and cloud only.")] = True,
     save_tracks: Annotated[bool, typer.Option("--save-tracks", help="Also write tracks.npz.")] = False,
     overwrite: Annotated[bool, typer.Option("--overwrite", help="Replace an earlier result.")] = False,
     quiet: Annotated[bool, typer.Option("--quiet", "-q", help="Warnings and the result only.")] = False,
 ) -> None:
     """Reconstruct a sequence: trajectory, cloud, meshes, depth and normal maps."""
-    one_thread_each()
-    keep_freed_memory()
-    skip_machine_learning()
+    prepare()
     from vitamin3d.job import Job, Selection
 
     voxels = _voxels(voxel_low, voxel_high, metric_scale, scale_from_ground_truth)
@@ -77,6 +74,7 @@ def reconstruct(
         save_tracks,
         live or realtime,
         realtime,
+        mesh,
     )
     try:
         code = _run(source, calibration, job, out, overwrite, quiet)

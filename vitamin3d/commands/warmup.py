@@ -3,12 +3,12 @@
 
 import typer
 
-from vitamin3d.commands.process import one_thread_each
+from vitamin3d.commands.process import prepare
 
 
 def warmup() -> None:
     """Compile all numerical kernels now (about a minute, once), so that no later run has to."""
-    one_thread_each()
+    prepare()
     from vitamin3d.progress import warmed_up
 
     seconds = warmed_up()

@@ -6,7 +6,9 @@ the full pictures refine it along the epipolar lines. What is found joins the la
 the deviation that its parallax leaves.
 """
 
-from dataclasses import dataclass, replace
+from collections.abc import Callable
+from dataclasses import replace
+from functools import cached_property
 
 import numpy as np
 
@@ -17,7 +19,7 @@ from vitamin3d.dense.neighbour_queue import Around
 from vitamin3d.dense.plane_sweep import PlaneSweep, SweptDepth, turned
 from vitamin3d.geometry.camera import Camera
 from vitamin3d.geometry.se3 import inverse
-from vitamin3d.types import Array, MapSnapshot
+from vitamin3d.types import Array, Frame, MapSnapshot
 
 REDUCTION = 2
 REFINEMENT_STEPS, REFINEMENT_STEP_PX = 4, 0.7
@@ -26,23 +28,34 @@ MIN_PATCH_DEVIATION = 2.0
 """Grey levels; flatter patches are not compared."""
 
 
-@dataclass(frozen=True)
 class CanvasPicture:
-    """A keyframe ready to be compared with others."""
+    """A keyframe to be compared with others; its pictures are drawn when they are first asked for: many are neighbours of none.
 
-    snapshot: MapSnapshot
-    image: Array
-    """(H, W) uint8 on the canvas, 0 = no picture."""
-    reduced: Array
-    """(H / 2, W / 2) uint8."""
+    Args:
+        draw: a frame's picture (H, W) uint8 on the canvas.
+        is_outside: (H, W) bool, where on the canvas there is no picture.
+    """
 
+    def __init__(self, snapshot: MapSnapshot, draw: Callable[[Frame], Array], is_outside: Array) -> None:
+        self.snapshot, self._draw, self._is_outside = snapshot, draw, is_outside
 
-def canvas_picture(snapshot: MapSnapshot, image: Array, is_outside: Array) -> CanvasPicture:
-    """A keyframe with its picture (H, W) on the canvas; `is_outside` (H, W) bool says where there is none."""
-    height, width = (n // REDUCTION for n in image.shape)
-    masked, reduced = np.empty(image.shape, np.uint8), np.empty((height, width), np.uint8)
-    _mask_and_reduce(np.ascontiguousarray(image), is_outside, masked, reduced)
-    return CanvasPicture(snapshot, masked, reduced)
+    @property
+    def image(self) -> Array:
+        """(H, W) uint8 on the canvas, 0 = no picture."""
+        return self._pictures[0]
+
+    @property
+    def reduced(self) -> Array:
+        """(H / 2, W / 2) uint8."""
+        return self._pictures[1]
+
+    @cached_property
+    def _pictures(self) -> tuple[Array, Array]:
+        image = np.ascontiguousarray(self._draw(self.snapshot.frame))
+        height, width = (n // REDUCTION for n in image.shape)
+        masked, reduced = np.empty(image.shape, np.uint8), np.empty((height, width), np.uint8)
+        _mask_and_reduce(image, self._is_outside, masked, reduced)
+        return masked, reduced
 
 
 @kernel

@@ -7,6 +7,7 @@ from typing import Any, Protocol
 
 import numpy as np
 
+from vitamin3d._jit import kernel
 from vitamin3d.dense.block_volume import BlockVolume
 from vitamin3d.dense.voxel_cloud import shape_of
 from vitamin3d.errors import DependencyError, InputError
@@ -114,13 +115,9 @@ class _ScalableVolume:
     def integrate(self, view: DepthView, canvas: Camera, max_depth: float) -> None:
         import open3d as o3d
 
-        rgbd = o3d.geometry.RGBDImage.create_from_color_and_depth(
-            o3d.geometry.Image(np.ascontiguousarray(view.color)),
-            o3d.geometry.Image(certain_depth(view, self._limits.relative_deviation)),
-            depth_scale=1.0,
-            depth_trunc=max_depth,
-            convert_rgb_to_intensity=False,
-        )
+        rgbd = o3d.geometry.RGBDImage()
+        rgbd.color = o3d.geometry.Image(np.ascontiguousarray(view.color))
+        rgbd.depth = o3d.geometry.Image(certain_depth(view, self._limits.relative_deviation, max_depth))
         pinhole = o3d.camera.PinholeCameraIntrinsic(canvas.width, canvas.height, canvas.fx, canvas.fy, canvas.cx, canvas.cy)
         self._volume.integrate(rgbd, pinhole, view.T_cam_world)
 
@@ -155,7 +152,7 @@ class _VoxelBlockGrid:
     def integrate(self, view: DepthView, canvas: Camera, max_depth: float) -> None:
         import open3d as o3d
 
-        depth = o3d.t.geometry.Image(o3d.core.Tensor(certain_depth(view, self._limits.relative_deviation)))
+        depth = o3d.t.geometry.Image(o3d.core.Tensor(certain_depth(view, self._limits.relative_deviation, max_depth)))
         color = o3d.t.geometry.Image(o3d.core.Tensor(view.color.astype(np.float32) / 255.0))
         K, T = o3d.core.Tensor(canvas.K), o3d.core.Tensor(np.ascontiguousarray(view.T_cam_world, np.float64))
         scales = (1.0, max_depth, self._truncation_voxels)
@@ -197,9 +194,19 @@ class _WeightedBlocks:
 BACKENDS: dict[str, type[_Backend]] = {"scalable": _ScalableVolume, "voxel_block_grid": _VoxelBlockGrid, "blocks": _WeightedBlocks}
 
 
-def certain_depth(view: DepthView, max_relative_deviation: float) -> Array:
-    """The view's depth (H, W) float32 without the pixels (0) whose deviation is above this share of their depth."""
-    return np.where(view.weights * (max_relative_deviation * view.depth) ** 2 >= 1.0, view.depth, 0.0).astype(np.float32)
+def certain_depth(view: DepthView, max_relative_deviation: float, max_depth: float) -> Array:
+    """The view's depth (H, W) float32 without the pixels (0) that are too far, or whose deviation is above this share of their depth."""
+    depth, weights = (np.ascontiguousarray(a, np.float32) for a in (view.depth, view.weights))
+    out = np.empty_like(depth)
+    _keep_certain(depth.ravel(), weights.ravel(), np.float32(max_relative_deviation), np.float32(max_depth), out.ravel())
+    return out
+
+
+@kernel
+def _keep_certain(depth, weights, max_relative_deviation, max_depth, out):  # type: ignore[no-untyped-def]
+    for n in range(depth.shape[0]):
+        limit = max_relative_deviation * depth[n]
+        out[n] = depth[n] if depth[n] < max_depth and weights[n] * (limit * limit) >= np.float32(1.0) else np.float32(0.0)
 
 
 def empty_surface() -> Surface:

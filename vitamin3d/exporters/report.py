@@ -19,6 +19,8 @@ import numpy as np
 from vitamin3d.types import Array, Surface
 
 MAX_BYTES = 15_000_000
+LOW_BITS = (1 << 21) - 1
+"""Three numbers of a cell or a triangle share one integer."""
 MAX_TRIANGLES, MAX_POINTS, MAX_POSITIONS = 160_000, 120_000, 4000
 VIEWER = Path(__file__).with_name("report_viewer.js")
 POLICY = "default-src 'none'; img-src data:; style-src 'unsafe-inline'; script-src 'unsafe-inline'"
@@ -222,28 +224,40 @@ def decimated(surface: Surface, most: int) -> Surface:
     a, b, c = (surface.vertices_world[surface.triangles[:, k]] for k in range(3))
     area = float(0.5 * np.linalg.norm(np.cross(b - a, c - a), axis=1).sum())
     cell = max(np.sqrt(2 * area / most), 1e-9)
-    while len((found := _clustered(surface, cell)).triangles) > most:
+    while True:
+        group = _clusters(surface.vertices_world, cell)
+        triangles = _grouped_triangles(surface.triangles, group)
+        if len(triangles) <= most:
+            return _clustered(surface, group, triangles)
         cell *= 1.15
-    return found
 
 
-def _clustered(surface: Surface, cell: float) -> Surface:
-    cells = np.floor((surface.vertices_world - surface.vertices_world.min(axis=0)) / cell).astype(np.int64)
-    keys = (cells[:, 0] << 42) | (cells[:, 1] << 21) | cells[:, 2]
-    _, group, counts = np.unique(keys, return_inverse=True, return_counts=True)
-    group = group.reshape(-1)
+def _clusters(points: Array, cell: float) -> Array:
+    """(N,) number of the cell that each point lies in, without gaps."""
+    cells = np.floor((points - points.min(axis=0)) / cell).astype(np.int64)
+    return np.unique((cells[:, 0] << 42) | (cells[:, 1] << 21) | cells[:, 2], return_inverse=True)[1].reshape(-1)
+
+
+def _grouped_triangles(triangles: Array, group: Array) -> Array:
+    """The triangles (F, 3) between groups, each once, its lowest corner first."""
+    p, q, r = group[triangles].T
+    between = (p != q) & (q != r) & (r != p)
+    p, q, r = p[between], q[between], r[between]
+    lowest = [(r < p) & (r < q), (q < p) & (q < r)]
+    p, q, r = (np.select(lowest, turned, as_is) for turned, as_is in (((r, q), p), ((p, r), q), ((q, p), r)))
+    keys = np.unique((p << 42) | (q << 21) | r)
+    return np.stack([keys >> 42, (keys >> 21) & LOW_BITS, keys & LOW_BITS], axis=1).astype(np.int32)
+
+
+def _clustered(surface: Surface, group: Array, triangles: Array) -> Surface:
+    """The triangles between the means of the groups' vertices."""
+    counts = np.bincount(group)
     means = [
         np.stack([np.bincount(group, column[:, k].astype(np.float64)) / counts for k in range(3)], axis=1)
         for column in (surface.vertices_world, surface.normals_world, surface.colors)
     ]
-    triangles = group[surface.triangles]
-    p, q, r = triangles.T
-    triangles = triangles[(p != q) & (q != r) & (r != p)]
-    lowest = np.argmin(triangles, axis=1)[:, None]
-    turned = np.take_along_axis(triangles, (lowest + np.arange(3)) % 3, axis=1)
-    triangles = np.unique(turned, axis=0) if len(turned) else turned
     normals = means[1] / np.maximum(np.linalg.norm(means[1], axis=1, keepdims=True), 1e-12)
-    return Surface(means[0], triangles.astype(np.int32), normals, np.rint(means[2]).astype(np.uint8))
+    return Surface(means[0], triangles, normals, np.rint(means[2]).astype(np.uint8))
 
 
 def _base64(*parts: bytes) -> str:

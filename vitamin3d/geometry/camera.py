@@ -2,6 +2,7 @@
 """The pinhole camera with radial-tangential distortion (Brown–Conrady, OpenCV's k1 k2 p1 p2, EuRoC's `sensor.yaml`)."""
 
 from dataclasses import dataclass, replace
+from functools import cached_property
 
 import cv2
 import numpy as np
@@ -160,6 +161,11 @@ class Camera:
         left, top = np.minimum(low, 0.0)
         width, height = (np.maximum(high, size - 1) - np.minimum(low, 0.0) + 1).astype(int)
         return Camera(self.fx, self.fy, float(self.cx - left), float(self.cy - top), int(width), int(height))
+
+    @cached_property
+    def whole_canvas(self) -> "Camera":
+        """`canvas` with its own limit, computed once."""
+        return self.canvas()
 
     def canvas_maps(self, canvas: "Camera") -> tuple[Array, Array]:
         """`cv2.remap` maps (H, W) float32 that draw this camera's picture on `canvas`."""

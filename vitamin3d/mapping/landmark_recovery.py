@@ -102,7 +102,7 @@ def _list_candidates(  # type: ignore[no-untyped-def]
 
 def _visible_candidates(sparse_map: SparseMap, live_ids: Array, T_cam_world: Array, camera: Camera, config: RecoveryConfig) -> Array:
     """Ids of landmarks, not tracked now, that were last seen from a similar direction and distance."""
-    size, canvas = len(sparse_map.points_world), camera.canvas()
+    size, canvas = len(sparse_map.points_world), camera.whole_canvas
     view = camera.fx, camera.fy, canvas.cx, canvas.cy, canvas.width, canvas.height
     is_live, ids = np.zeros(size, np.bool_), np.empty(size, np.int64)
     is_live[live_ids[live_ids < size]] = True

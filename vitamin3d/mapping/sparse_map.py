@@ -6,6 +6,8 @@ first keyframe on; it becomes a landmark when it gets a point (`points_world` is
 observations count from that moment.
 """
 
+from typing import Any
+
 import numpy as np
 
 from vitamin3d._jit import kernel
@@ -56,9 +58,12 @@ class GrowingArray:
     """An array whose first axis grows by doubling; `view` is the used part."""
 
     def __init__(self, shape: tuple[int, ...], dtype: type, fill: float) -> None:
-        self._data: Array = np.full((1024, *shape), fill, dtype)
         self._fill = fill
+        self._data = self._filled((1024, *shape), dtype)
         self.size = 0
+
+    def _filled(self, shape: tuple[int, ...], dtype: Any) -> Array:
+        return np.full(shape, self._fill, dtype) if self._fill else np.zeros(shape, dtype)  # zeros cost nothing until they are used
 
     @property
     def view(self) -> Array:
@@ -66,7 +71,7 @@ class GrowingArray:
 
     def resize(self, size: int) -> None:
         if size > len(self._data):
-            grown = np.full((max(size, 2 * len(self._data)), *self._data.shape[1:]), self._fill, self._data.dtype)
+            grown = self._filled((max(size, 2 * len(self._data)), *self._data.shape[1:]), self._data.dtype)
             grown[: self.size] = self._data[: self.size]
             self._data = grown
         self.size = max(self.size, size)
