@@ -361,7 +361,7 @@ class DensificationConfig:
     min_overlap: float = 0.5
     """Share of the landmarks that a neighbour must see."""
     min_landmarks: int = 30
-    planes: int = 48
+    planes: int = 40
     small_penalty: float = 5.0
     """Of a step to the next plane, in bits of the census."""
     edge_penalty: float = 50.0
@@ -395,7 +395,7 @@ class NltgvConfig:
     """NLTGV²-L1 on the Delaunay graph (Greene and Roy 2017), diagonal preconditioning (Pock and Chambolle 2011)."""
 
     enabled: bool = True
-    iterations: int = 60
+    iterations: int = 45
     primal_share: float = 0.03
     """Primal steps are multiplied and dual ones divided by this; 1 takes eight times the iterations."""
     data_weight: float = 4.0
@@ -611,7 +611,7 @@ def live_config(base: Config) -> Config:
         calibration=change(base.calibration, refine="off"),
         memory=change(base.memory, max_keyframes=600, max_new_tracks=60_000),
         densification=change(base.densification, reach=3, planes=32, max_wait_s=1.0),
-        nltgv=change(base.nltgv, iterations=min(60, base.nltgv.iterations)),
+        nltgv=change(base.nltgv, iterations=min(45, base.nltgv.iterations)),
         consistency=change(base.consistency, first=1, per_side=1, max_wait_s=1.25),
         fusion=change(base.fusion, keyframes_for_depth=10, backend="blocks"),
     )

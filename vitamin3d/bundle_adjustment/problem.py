@@ -98,7 +98,7 @@ def select_points(problem: BundleProblem, keep: Array) -> BundleProblem:
         points_world=problem.points_world[keep],
         obs_camera=problem.obs_camera[rows],
         obs_point=obs_point,
-        obs_pixels=problem.obs_pixels[rows],
+        obs_pixels=problem.obs_pixels.take(rows, axis=0),
         point_starts=starts,
         point_order=order,
         landmark_ids=problem.landmark_ids[keep],

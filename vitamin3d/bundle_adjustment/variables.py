@@ -55,7 +55,7 @@ def sightings_of(problem: BundleProblem, pixels: Array | None = None) -> Sightin
     pixels, order = np.ascontiguousarray(problem.obs_pixels if pixels is None else pixels), problem.point_order
     by_length = np.empty(len(problem.points_world), np.int64)
     longest = longest_first(problem.point_starts, by_length)
-    by_point = problem.point_starts, problem.obs_camera[order], pixels[order], by_length
+    by_point = problem.point_starts, problem.obs_camera[order], pixels.take(order, axis=0), by_length
     return Sightings(*by_point, longest, _camera_starts(problem), np.ascontiguousarray(problem.obs_point), pixels)
 
 

@@ -166,14 +166,15 @@ def rasterize(pixels: Array, triangles: Array, layers: Array, width: int, height
 def _shade(xi, slope_u, slope_v, intrinsics, depth, normals):  # type: ignore[no-untyped-def]
     """The plane <n, X> = 1 has the inverse depth <n, ray>: its gradient gives n_x / fx and n_y / fy, n_z is what remains."""
     fx, fy, cx, cy = intrinsics
+    one, none = np.float32(1.0), np.float32(0.0)
     for v in range(xi.shape[0]):
-        y, nearness, across, down, far, normal = (v - cy) / fy, xi[v], slope_u[v], slope_v[v], depth[v], normals[v]
+        y, nearness, across, down, far, normal = (np.float32(v) - cy) / fy, xi[v], slope_u[v], slope_v[v], depth[v], normals[v]
         for u in range(xi.shape[1]):
-            is_there = nearness[u] > 0.0
+            is_there = nearness[u] > none
             nx, ny = across[u] * fx, down[u] * fy
-            nz = nearness[u] - nx * (u - cx) / fx - ny * y
-            scale = -1.0 / np.sqrt(nx * nx + ny * ny + nz * nz) if is_there else 0.0
-            far[u] = 1.0 / nearness[u] if is_there else 0.0
+            nz = nearness[u] - across[u] * (np.float32(u) - cx) - ny * y
+            scale = -one / np.sqrt(nx * nx + ny * ny + nz * nz) if is_there else none
+            far[u] = one / nearness[u] if is_there else none
             normal[u, 0], normal[u, 1], normal[u, 2] = nx * scale, ny * scale, nz * scale
 
 
@@ -185,5 +186,5 @@ def depth_and_normals(layers: Array, canvas: Camera) -> tuple[Array, Array]:
     """
     depth, normals = np.empty(layers.shape[:2], np.float32), np.empty((*layers.shape[:2], 3), np.float32)
     xi, slope_u, slope_v = (np.ascontiguousarray(layers[..., k], np.float32) for k in range(3))
-    _shade(xi, slope_u, slope_v, canvas.intrinsics, depth, normals)
+    _shade(xi, slope_u, slope_v, canvas.intrinsics.astype(np.float32), depth, normals)
     return depth, normals

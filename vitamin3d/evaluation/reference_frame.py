@@ -12,10 +12,11 @@ from dataclasses import dataclass
 from enum import Enum
 
 import numpy as np
+from scipy.spatial.transform import Rotation
 
 from vitamin3d.errors import InputError
 from vitamin3d.evaluation.trajectory_error import Alignment, aligned, orientation_errors_deg, position_errors, rotation_angles_deg
-from vitamin3d.geometry.se3 import inverse, log_so3, quaternion_xyzw, rotation_from_quaternion
+from vitamin3d.geometry.se3 import inverse, quaternion_xyzw, rotation_from_quaternion
 from vitamin3d.types import Array, Trajectory
 
 MAX_PAIRS = 400
@@ -57,7 +58,7 @@ class FrameFinding:
 def turns(trajectory: Trajectory, pairs: Array) -> Array:
     """Rotation vectors (P, 3), radians, of the camera's turn from one row to another."""
     R = trajectory.T_world_cam[:, :3, :3]
-    return np.array([log_so3(R[i].T @ R[j]) for i, j in pairs]).reshape(-1, 3)
+    return Rotation.from_matrix(R[pairs[:, 0]].transpose(0, 2, 1) @ R[pairs[:, 1]]).as_rotvec()
 
 
 def spread_pairs(count: int) -> Array:

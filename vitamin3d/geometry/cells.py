@@ -44,13 +44,18 @@ def _sort(points, corner, side, columns, starts, order):  # type: ignore[no-unty
         filled[numbers[p]] += 1
 
 
+def bounds(points: Array) -> tuple[Array, tuple[float, float]]:
+    """The low corner (2,) float64, and the width and height, of points (N, 2); column by column, which numpy does many times faster."""
+    (left, right), (top, bottom) = ((float(column.min()), float(column.max())) for column in points.T)
+    return np.array([left, top]), (right - left, bottom - top)
+
+
 def cells_of(points: Array, points_per_cell: float, least_side: float = 0.0) -> Cells:
     """Cells of points (N, 2), N > 0, finite, so large that about so many fall into one, or larger."""
-    corner, (width, height) = points.min(axis=0), np.ptp(points, axis=0)
-    longer = max(float(width), float(height))
-    side = max(float(np.sqrt(width * height * points_per_cell / len(points))), longer / len(points), least_side)
+    corner, (width, height) = bounds(points)
+    side = max(float(np.sqrt(width * height * points_per_cell / len(points))), max(width, height) / len(points), least_side)
     side = side if side > 0.0 else 1.0
     columns, rows = int(width / side) + 1, int(height / side) + 1
     starts, order = np.zeros(columns * rows + 1, np.int32), np.empty(len(points), np.int32)
-    _sort(np.ascontiguousarray(points, np.float64), corner.astype(np.float64), side, columns, starts, order)
+    _sort(np.ascontiguousarray(points, np.float64), corner, side, columns, starts, order)
     return Cells(order, starts, columns, rows, side)

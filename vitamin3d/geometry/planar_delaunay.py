@@ -13,7 +13,7 @@ one that leads back.
 import numpy as np
 
 from vitamin3d._jit import inlined, kernel
-from vitamin3d.geometry.cells import cells_of
+from vitamin3d.geometry.cells import bounds, cells_of
 from vitamin3d.types import Array
 
 GRID_BITS = 25
@@ -229,8 +229,8 @@ def delaunay(points: Array) -> tuple[Array, Array]:
     count = len(points)
     if count < 3:
         return _nothing()
-    corner = points.min(axis=0)
-    extent = float((points - corner).max())
+    corner, size = bounds(points)
+    extent = max(size)
     if extent <= 0.0:
         return _nothing()
     scale = 2.0 ** (GRID_BITS - 1 - np.floor(np.log2(extent)))

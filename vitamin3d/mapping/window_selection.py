@@ -127,7 +127,7 @@ def build_problem(sparse_map: SparseMap, window: Window, view: tuple[Array, Arra
         sparse_map.points_world, local, ids, rows, obs_camera, obs_point,
     )  # fmt: skip
     rows, obs_camera, obs_point, ids = rows[:num_obs], obs_camera[:num_obs], obs_point[:num_obs], ids[:num_points]
-    poses, pixels = sparse_map.T_cam_world[window.keyframes], sparse_map.obs_pixels[rows]
+    poses, pixels = sparse_map.T_cam_world[window.keyframes], sparse_map.obs_pixels.take(rows, axis=0)
     is_free = np.arange(len(poses)) < window.num_adjusted
     is_free[: window.num_fixed] = False
     if view is not None:

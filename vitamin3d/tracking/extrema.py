@@ -8,6 +8,7 @@ from vitamin3d.config import ExtremaConfig
 from vitamin3d.types import Array
 
 CELL_PX = 32
+HIGHEST_BITS, PLACE_BITS = 2**31 - 1, 2**32 - 1
 
 
 @kernel
@@ -49,14 +50,14 @@ def is_round(kappa, u, v, min_roundness):  # type: ignore[no-untyped-def]
 
 @kernel
 def _list_marked(kappa, places, min_roundness, extrema, strengths):  # type: ignore[no-untyped-def]
-    """(u, v) of those flat pixel indices that are round enough, and minus kappa there; their number is returned."""
+    """(u, v) of those flat pixel indices that are round enough, and kappa there; their number is returned."""
     width, count = kappa.shape[1], 0
     for i in range(places.shape[0]):
         v, u = places[i] // width, places[i] % width
         if not is_round(kappa, u, v, min_roundness):
             continue
         extrema[count, 0], extrema[count, 1] = u, v
-        strengths[count] = -kappa[v, u]
+        strengths[count] = kappa[v, u]
         count += 1
     return count
 
@@ -100,11 +101,21 @@ def _occupy(pixels, radius, occupied):  # type: ignore[no-untyped-def]
 def detect_extrema(kappa: Array, config: ExtremaConfig) -> Array:
     """The local maxima (E, 2) int32 `u v` of kappa (H, W) above the noise floor that are round enough, strongest first."""
     is_maximum = np.empty(kappa.shape, np.bool_)
-    _mark_maxima(kappa, np.float32(config.min_curvature), max(1, config.border_px), is_maximum)
+    _mark_maxima(kappa, np.float32(max(0.0, config.min_curvature)), max(1, config.border_px), is_maximum)
     places = np.flatnonzero(is_maximum)
     extrema, strengths = np.empty((len(places), 2), np.int32), np.empty(len(places), np.float32)
     count = _list_marked(kappa, places, config.min_roundness, extrema, strengths)
-    return extrema[np.argsort(strengths[:count], kind="stable")]
+    return extrema.take(strongest_first(strengths[:count]), axis=0)
+
+
+def strongest_first(strengths: Array) -> Array:
+    """(E,) int64: the order of positive strengths (E,) float32, of equal ones the first first.
+
+    A positive float's bits grow with it: with the place behind them they are integers that numpy sorts twice as fast.
+    """
+    keys = (HIGHEST_BITS - strengths.view(np.int32).astype(np.int64) << 32) | np.arange(len(strengths))
+    keys.sort()
+    return np.asarray(keys & PLACE_BITS)
 
 
 def refine_extrema(kappa: Array, extrema: Array) -> Array:
