@@ -51,6 +51,16 @@ def test_trajectory_is_the_true_one(demo_run: Path) -> None:
     assert 0.0 < np.median(degrees) < 0.3
 
 
+def test_without_a_mesh_the_trajectory_and_the_cloud_are_the_same(demo_run: Path, tmp_path: Path) -> None:
+    out = tmp_path / "out"
+    done = vitamin3d("reconstruct", str(DEMO), "-o", str(out), "--scale-from-ground-truth", "--no-mesh")
+    assert done.returncode == 0, done.stderr
+    for name in ("trajectory.tum", "keyframes.tum", "cloud.ply"):
+        assert (out / name).read_bytes() == (demo_run / name).read_bytes()
+    assert not [name for name in ("mesh_high.ply", "mesh_low.ply", "mesh_high.obj", "depth", "normals") if (out / name).exists()]
+    assert (out / "report.html").is_file() and json.loads((out / "stats.json").read_text())["empty_meshes"] == []
+
+
 def test_surface_lies_on_the_true_one(demo_run: Path) -> None:
     import open3d as o3d
 

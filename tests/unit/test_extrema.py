@@ -6,7 +6,15 @@ from scenes import texture
 
 from vitamin3d.config import CurvatureConfig, ExtremaConfig
 from vitamin3d.tracking.curvature import curvature
-from vitamin3d.tracking.extrema import CELL_PX, detect_extrema, refine_extrema, roundness, select_free_extrema, subpixel_offset
+from vitamin3d.tracking.extrema import (
+    CELL_PX,
+    detect_extrema,
+    refine_extrema,
+    roundness,
+    select_free_extrema,
+    strongest_first,
+    subpixel_offset,
+)
 
 LOW = ExtremaConfig(min_curvature=0.0, border_px=1, min_roundness=0.0)
 
@@ -52,6 +60,12 @@ def test_strongest_come_first_and_floor_and_border_hold(rng):
     assert found.min() >= 9 and (found < [120 - 9, 90 - 9]).all()
     assert found.dtype == np.int32
     assert as_set(found) == reference.local_maxima(kappa, 0.5, 9)
+
+
+def test_equal_strengths_keep_their_order(rng):
+    strengths = rng.choice(np.float32([1e-30, 0.15, 0.2, 3.0, 1e30]), 200)
+    np.testing.assert_array_equal(strongest_first(strengths), np.argsort(-strengths, kind="stable"))
+    assert len(strongest_first(strengths[:0])) == 0
 
 
 def test_roundness_is_that_of_the_hessian(rng):

@@ -6,7 +6,7 @@ import pytest
 import reference_dense as reference
 from scipy.spatial import ConvexHull, Delaunay
 
-from vitamin3d.geometry.cells import cell_number, cells_of
+from vitamin3d.geometry.cells import bounds, cell_number, cells_of
 from vitamin3d.geometry.planar_delaunay import _is_in_circle, _product_parts, delaunay
 
 
@@ -142,6 +142,13 @@ def test_the_same_twice():
     points = np.random.default_rng(4).uniform(0, 640, (2000, 2))
     for one, other in zip(delaunay(points), delaunay(points.copy()), strict=True):
         np.testing.assert_array_equal(one, other)
+
+
+def test_bounds():
+    points = np.random.default_rng(0).normal(size=(50, 2))
+    corner, size = bounds(points)
+    np.testing.assert_array_equal(corner, points.min(axis=0))
+    np.testing.assert_array_equal(size, np.ptp(points, axis=0))
 
 
 def test_cells_hold_their_points():

@@ -58,7 +58,7 @@ class FrameFinding:
 def turns(trajectory: Trajectory, pairs: Array) -> Array:
     """Rotation vectors (P, 3), radians, of the camera's turn from one row to another."""
     R = trajectory.T_world_cam[:, :3, :3]
-    return Rotation.from_matrix(R[pairs[:, 0]].transpose(0, 2, 1) @ R[pairs[:, 1]]).as_rotvec()
+    return np.asarray(Rotation.from_matrix(R[pairs[:, 0]].transpose(0, 2, 1) @ R[pairs[:, 1]]).as_rotvec())
 
 
 def spread_pairs(count: int) -> Array:

@@ -130,7 +130,7 @@ def recover_landmarks(
         T_cam_world: (4, 4) of the frame.
     """
     ids = _visible_candidates(sparse_map, tracks.ids, T_cam_world, camera, config)
-    points = sparse_map.points_world[ids]
+    points = sparse_map.points_world.take(ids, axis=0)
     ideal = camera.ideal_from_points(points @ T_cam_world[:3, :3].T + T_cam_world[:3, 3])
     predicted = measured_pixels(ideal, image_motion, camera)
     inside = camera.is_inside(predicted, BORDER_PX)
