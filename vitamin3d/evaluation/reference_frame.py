@@ -88,7 +88,8 @@ def check_quaternion_order(estimate: Trajectory, truth: Trajectory, T_body_cam: 
     R = np.eye(3) if T_body_cam is None else T_body_cam[:3, :3]
 
     def misfit(a: Trajectory, b: Trajectory) -> float:
-        return min(residual(turns(a, pairs), turns(b, pairs), F) for F in (np.eye(3), R, R.T))
+        turned, expected = turns(a, pairs), turns(b, pairs)
+        return min(residual(turned, expected, F) for F in (np.eye(3), R, R.T))
 
     if misfit(estimate, truth) <= UNRELATED:
         return
