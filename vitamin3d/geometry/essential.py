@@ -1,10 +1,11 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Relative pose of two views by the essential matrix (OpenCV's USAC), behind our types."""
+"""Relative pose of two views by the essential matrix: OpenCV's USAC, then the best motion for all pairs."""
 
 import cv2
 import numpy as np
 
 from vitamin3d.geometry.camera import Camera
+from vitamin3d.geometry.epipolar_refinement import refine_essential, sampson_distances
 from vitamin3d.geometry.triangulation import triangulate
 from vitamin3d.types import Array, TwoView
 
@@ -26,8 +27,17 @@ def relative_pose(pixels_0: Array, pixels_1: Array, camera: Camera, threshold_px
     E, mask = cv2.findEssentialMat(pixels_0, pixels_1, camera.K, cv2.USAC_ACCURATE, 0.999, threshold_px)
     if E is None or E.shape != (3, 3) or mask is None:
         return None
+    first = _in_front(E, mask.ravel() > 0, pixels_0, pixels_1, camera)
+    rays_0, rays_1 = camera.rays_from_ideal(pixels_0), camera.rays_from_ideal(pixels_1)
+    threshold = threshold_px / camera.fx
+    E = refine_essential(first.T_1_0[:3, :3], first.T_1_0[:3, 3], rays_0, rays_1, threshold)
+    return _in_front(E, np.abs(sampson_distances(E, rays_0, rays_1)) < threshold, pixels_0, pixels_1, camera)
+
+
+def _in_front(E: Array, is_inlier: Array, pixels_0: Array, pixels_1: Array, camera: Camera) -> TwoView:
+    """Of the four motions of an essential matrix the one with most points in front of both cameras."""
     R_a, R_b, t = cv2.decomposeEssentialMat(E)
-    candidates = [_two_view(R, s * t, mask.ravel() > 0, pixels_0, pixels_1, camera) for R in (R_a, R_b) for s in (1.0, -1.0)]
+    candidates = [_two_view(R, s * t, is_inlier, pixels_0, pixels_1, camera) for R in (R_a, R_b) for s in (1.0, -1.0)]
     return max(candidates, key=lambda view: int(np.isfinite(view.points_0[:, 0]).sum()))
 
 
