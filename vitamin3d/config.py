@@ -276,6 +276,8 @@ class CalibrationConfig:
     readout_systematic_factor: float = 5.0
     max_readout_deviation: float = 0.3
     """In intervals between two frames, systematic errors included; above it the motion does not determine the readout time."""
+    settled_readout_deviation: float = 0.06
+    """In intervals as well; below it, a camera that reads all rows at once is one, and its readout time is not looked for again."""
     points_per_keyframe: int = 200
     """Landmarks with the most observations that take part, about so many in each keyframe."""
     sigma_px: float = 1.0
@@ -366,7 +368,7 @@ class DensificationConfig:
     """Of a step to the next plane, in bits of the census."""
     edge_penalty: float = 50.0
     """Of a larger step, where the picture has no edge."""
-    cell_px: int = 8
+    cell_px: int = 6
     """One pixel per cell at most becomes a vertex."""
     min_distinctness: float = 1.3
     """Aggregated cost of the best other plane over the winner's."""
@@ -434,6 +436,9 @@ class DepthRenderingConfig:
     max_edge_ratio: float = 0.33
     """Longest edge in picture widths."""
     canvas_limit: float = 0.5
+    """The canvas reaches beyond the picture, undistorted, by at most so many of its widths and heights on each side."""
+    canvas_pixels: float = 1.0
+    """And has at most so many times its pixels: those of a lens's corners are spread far, and would be drawn several times."""
 
 
 @dataclass(frozen=True)

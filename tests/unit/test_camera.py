@@ -95,6 +95,17 @@ def test_the_canvas_of_a_pinhole_is_itself():
     assert PINHOLE.canvas() == PINHOLE
 
 
+def test_a_scaled_camera_sees_the_same_picture_in_other_pixels(rng):
+    scaled = PINHOLE.scaled(0.5)
+    assert (scaled.width, scaled.height) == (PINHOLE.width // 2, PINHOLE.height // 2)
+    corners = np.array([[-0.5, -0.5], [PINHOLE.width - 0.5, PINHOLE.height - 0.5]])
+    np.testing.assert_allclose(PINHOLE.ideal_in(scaled, corners), 0.5 * (corners + 0.5) - 0.5, atol=1e-12)
+    points = rng.uniform([-1, -1, 2], [1, 1, 5], (20, 3))
+    pixels = PINHOLE.ideal_from_points(points)
+    np.testing.assert_allclose(PINHOLE.ideal_in(scaled, pixels), scaled.ideal_from_points(points), atol=1e-9)
+    np.testing.assert_allclose(scaled.ideal_in(PINHOLE, scaled.ideal_from_points(points)), pixels, atol=1e-9)
+
+
 @pytest.mark.parametrize("coefficients", [EUROC.distortion, (0.3, 0.1, 0.0, 0.0)], ids=["barrel", "pincushion"])
 def test_the_canvas_shows_the_picture_where_it_belongs(coefficients):
     camera = dataclasses.replace(Camera(90.0, 92.0, 60.2, 45.1, 121, 93), distortion=coefficients)

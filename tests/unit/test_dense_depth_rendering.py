@@ -44,6 +44,33 @@ def test_the_nearest_surface_wins():
         np.testing.assert_allclose(rasterize(pixels, np.array(order, np.int32), layers, 5, 5)[1, 1], [2.0, 7.0])
 
 
+@pytest.mark.parametrize("pixels", [0.5, 1.0, 1.5, 9.0])
+def test_the_canvas_holds_all_of_the_picture_in_as_many_pixels_as_it_may_have(pixels):
+    camera = reference.EUROC
+    canvas = DepthRenderer(camera, dataclasses.replace(CONFIG, canvas_pixels=pixels)).canvas
+    whole = camera.canvas(CONFIG.canvas_limit)
+    size = canvas.width * canvas.height
+    assert size == pytest.approx(min(pixels * camera.width * camera.height, whole.width * whole.height), rel=5e-3)
+    assert canvas.fx / canvas.fy == pytest.approx(camera.fx / camera.fy)
+    middle = camera.ideal_in(canvas, camera.undistort(np.array([[0.0, 240.0], [751.0, 240.0], [367.0, 0.0], [367.0, 479.0]])))
+    assert canvas.is_inside(middle, -1.0).all()
+    assert middle[0, 0] < 0.02 * canvas.width + 20 and middle[1, 0] > 0.9 * canvas.width
+
+
+@pytest.mark.parametrize("pixels", [0.3, 1.0, 9.0])
+def test_a_plane_is_the_same_on_a_canvas_of_any_size(pixels):
+    camera = reference.EUROC
+    snapshot = reference.snapshot_of_plane(camera, NORMAL, 3000, np.random.default_rng(0))
+    mesh = triangulate(snapshot, DelaunayConfig())
+    renderer = DepthRenderer(camera, dataclasses.replace(CONFIG, canvas_pixels=pixels))
+    view = renderer.render(snapshot, mesh, vertex_slopes(mesh))
+    v, u = np.nonzero(view.depth)
+    expected = 1.0 / (renderer.canvas.rays_from_ideal(np.stack([u, v], axis=1).astype(float)) @ NORMAL)
+    assert len(v) > 0.5 * view.depth.size
+    np.testing.assert_allclose(view.depth[v, u], expected, rtol=1e-4)
+    np.testing.assert_allclose(view.normals_cam[v, u], np.broadcast_to(-NORMAL / np.linalg.norm(NORMAL), (len(u), 3)), atol=1e-4)
+
+
 @pytest.mark.parametrize("camera", [reference.SMALL, reference.EUROC])
 def test_a_plane_comes_back_with_depth_normal_and_colour(camera):
     snapshot = reference.snapshot_of_plane(camera, NORMAL, 3000, np.random.default_rng(0))
@@ -58,22 +85,22 @@ def test_a_plane_comes_back_with_depth_normal_and_colour(camera):
     assert (view.normals_cam[~drawn] == 0).all()
     assert view.depth.shape == (canvas.height, canvas.width) and view.depth.dtype == np.float32
     assert view.color.shape == (*view.depth.shape, 3) and (np.ptp(view.color, axis=2) == 0).all() and view.color[drawn].min() >= 49
-    assert view.timestamp_ns == 7 and drawn.sum() > 0.9 * camera.width * camera.height
+    assert view.timestamp_ns == 7 and drawn.sum() > 0.9 * camera.width * camera.height * (canvas.fx / camera.fx) ** 2
 
 
 def test_nothing_is_drawn_outside_the_source_picture():
     camera = reference.EUROC
     renderer = DepthRenderer(camera, CONFIG)
     canvas = renderer.canvas
-    corners = np.array([[-1, -1], [2 * canvas.width, -1], [-1, 2 * canvas.height]]) - [canvas.cx - camera.cx, canvas.cy - camera.cy]
+    corners = canvas.ideal_in(camera, np.array([[-1, -1], [2 * canvas.width, -1], [-1, 2 * canvas.height]]))
     snapshot = reference.snapshot_of_plane(camera, [0, 0, 0.5], 3, np.random.default_rng(0))
     mesh = mesh_of(corners, [0.5, 0.5, 0.5])
     config = dataclasses.replace(CONFIG, max_edge_ratio=10.0)
     view = DepthRenderer(camera, config).render(snapshot, mesh, np.zeros((3, 2)))
     v, u = np.nonzero(view.depth)
-    ideal = np.stack([u, v], axis=1) - [canvas.cx - camera.cx, canvas.cy - camera.cy]
+    ideal = canvas.ideal_in(camera, np.stack([u, v], axis=1))
     assert camera.is_inside(camera.distort(ideal), -0.05).all()  # OpenCV rounds to 1/32 pixel
-    assert len(u) > 1.05 * camera.width * camera.height  # all of the picture, which the barrel lens stretches
+    assert len(u) > 0.8 * view.depth.size  # all of the picture, which the barrel lens stretches
     assert view.depth[0, 0] == 0 and view.depth[-1, -1] == 0
 
 

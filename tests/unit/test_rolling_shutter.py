@@ -159,6 +159,16 @@ def test_a_global_shutter_is_said_to_be_one(rng):
     refinement = CalibrationRefinement(PINHOLE, CONFIG)
     assert refinement.refine(sparse_map, PINHOLE) is PINHOLE
     assert refinement.history[-1].reason == "all rows were read at once"
+    assert refinement.refine(sparse_map, PINHOLE) is PINHOLE
+    assert sum("readout_s" in r.deviations for r in refinement.history) == 1, "what is settled is not looked for again"
+
+
+def test_a_readout_time_that_is_not_known_well_enough_is_looked_for_again(rng):
+    sparse_map, _ = map_read_by(PINHOLE, rng)
+    refinement = CalibrationRefinement(PINHOLE, dataclasses.replace(CONFIG, settled_readout_deviation=1e-6))
+    for _ in range(2):
+        refinement.refine(sparse_map, PINHOLE)
+    assert sum("readout_s" in r.deviations for r in refinement.history) == 2
 
 
 def test_a_camera_that_hardly_moves_does_not_tell(rng):

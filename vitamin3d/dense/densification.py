@@ -276,10 +276,9 @@ class Densifier:
         return np.asarray(inverse_depths[:, None] * np.hypot(u, v) / (1.0 + inverse_depths[:, None] * motions[None, :, 2]) ** 2)
 
     def _joined(self, snapshot: MapSnapshot, pixels: Array, inverse_depths: Array, deviations: Array) -> MapSnapshot:
-        shift = np.array([self.canvas.cx - self.camera.cx, self.canvas.cy - self.camera.cy])
         return replace(
             snapshot,
-            pixels=np.concatenate([snapshot.pixels, pixels - shift]),
+            pixels=np.concatenate([snapshot.pixels, self.canvas.ideal_in(self.camera, pixels)]),
             depths=np.concatenate([snapshot.depths, 1.0 / inverse_depths]),
             relative_deviations=np.concatenate([snapshot.relative_deviations, deviations]),
         )

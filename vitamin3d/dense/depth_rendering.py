@@ -16,7 +16,9 @@ class DepthRenderer:
     def __init__(self, camera: Camera, config: DepthRenderingConfig) -> None:
         self.camera = camera
         self.config = config
-        self.canvas = camera.canvas(config.canvas_limit)
+        whole = camera.canvas(config.canvas_limit)
+        share = config.canvas_pixels * camera.width * camera.height / (whole.width * whole.height)
+        self.canvas = whole if share >= 1.0 else whole.scaled(float(np.sqrt(share)))
         self._maps = camera.canvas_maps(self.canvas)
         white = np.full((camera.height, camera.width), 255, np.uint8)
         self.is_outside = camera.draw_on_canvas(white, self._maps) < 255
@@ -26,11 +28,11 @@ class DepthRenderer:
         return self.camera.draw_on_canvas(frame.image, self._maps)
 
     def render(self, snapshot: MapSnapshot, mesh: ImageMesh, slopes: Array) -> DepthView:
-        """Depth, normals and colour of a keyframe; `slopes` (V, 2) is the gradient of inverse depth at the vertices."""
+        """Depth, normals and colour of a keyframe; `slopes` (V, 2) is the gradient of inverse depth, per pixel of the camera."""
         kept = mesh.triangles[is_surface(mesh, self.camera, self.config)]
-        shift = np.array([self.canvas.cx - self.camera.cx, self.canvas.cy - self.camera.cy])
-        layers = np.column_stack([mesh.inverse_depth, slopes, mesh.relative_deviation])
-        drawn = rasterize(mesh.pixels + shift, kept, layers, self.canvas.width, self.canvas.height)
+        per_canvas_pixel = slopes * [self.camera.fx / self.canvas.fx, self.camera.fy / self.canvas.fy]
+        layers = np.column_stack([mesh.inverse_depth, per_canvas_pixel, mesh.relative_deviation])
+        drawn = rasterize(self.camera.ideal_in(self.canvas, mesh.pixels), kept, layers, self.canvas.width, self.canvas.height)
         drawn[self.is_outside, 0] = 0.0
         depth, normals = depth_and_normals(drawn[..., :3], self.canvas)
         weights = inverse_variances(depth, drawn[..., 3])

@@ -37,7 +37,7 @@ def triangle_numbers(pixels: Array, triangles: Array, width: int, height: int) -
 def marked(view: DepthView, mesh: ImageMesh, renderer: DepthRenderer, config: PhotometricConfig) -> DepthView:
     """The view with the numbers of its doubtful triangles at their pixels."""
     canvas, camera = renderer.canvas, renderer.camera
-    pixels = mesh.pixels + np.array([canvas.cx - camera.cx, canvas.cy - camera.cy])
+    pixels = camera.ideal_in(canvas, mesh.pixels)
     numbers = triangle_numbers(pixels, mesh.triangles[is_doubtful(mesh, config)], canvas.width, canvas.height)
     return replace(view, doubtful=numbers)
 

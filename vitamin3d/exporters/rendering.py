@@ -21,8 +21,7 @@ LABEL_HEIGHT, GAP = 26, 6
 
 def viewer(canvas: Camera, width: int) -> Camera:
     """The canvas camera, scaled to a picture of this width."""
-    s = width / canvas.width
-    return Camera(canvas.fx * s, canvas.fy * s, (canvas.cx + 0.5) * s - 0.5, (canvas.cy + 0.5) * s - 0.5, width, round(canvas.height * s))
+    return canvas.scaled(width / canvas.width)
 
 
 def stepped_aside(T_cam_world: Array, target_depth: float, right: float, up: float, back: float) -> Array:

@@ -162,6 +162,16 @@ class Camera:
         width, height = (np.maximum(high, size - 1) - np.minimum(low, 0.0) + 1).astype(int)
         return Camera(self.fx, self.fy, float(self.cx - left), float(self.cy - top), int(width), int(height))
 
+    def scaled(self, factor: float) -> "Camera":
+        """The camera of the same picture with `factor` times as many pixels along each side, without distortion."""
+        cx, cy = (factor * (center + 0.5) - 0.5 for center in (self.cx, self.cy))
+        return Camera(factor * self.fx, factor * self.fy, cx, cy, round(factor * self.width), round(factor * self.height))
+
+    def ideal_in(self, other: "Camera", pixels: Array) -> Array:
+        """Ideal pixels (N, 2) of this camera where another camera at the same place, turned alike, sees the same rays."""
+        factors = np.array([other.fx / self.fx, other.fy / self.fy])
+        return np.asarray(factors * (pixels - [self.cx, self.cy]) + [other.cx, other.cy])
+
     @cached_property
     def whole_canvas(self) -> "Camera":
         """`canvas` with its own limit, computed once."""

@@ -16,6 +16,9 @@ from vitamin3d.types import Array
 DIRECTIONS = np.array(list(product((-1.0, 0.0, 1.0), repeat=3))[14:])
 """(13, 3): of the 26 neighbours of a cube's middle one from each opposite pair, whose essential matrices are the same."""
 
+SEARCH_PAIRS = 500
+"""At most so many tell which minimum is the least; all of them refine it."""
+
 
 def sampson_distances(E: Array, rays_0: Array, rays_1: Array) -> Array:
     """(N,) signed first-order distances of paired rays (N, 3) with z = 1 from x_1ᵀ E x_0 = 0, in units of the focal length."""
@@ -32,21 +35,26 @@ def refine_essential(R: Array, t: Array, rays_0: Array, rays_1: Array, sigma: fl
         rays_0, rays_1: (N, 3) paired, z = 1, N >= 5.
         sigma: scale of the cost, in units of the focal length.
     """
-    minima = [_minimum(R, start / np.linalg.norm(start), rays_0, rays_1, sigma) for start in (t, *DIRECTIONS)]
-    return min(minima, key=lambda minimum: minimum[0])[1]
+    some = slice(None, None, -(-len(rays_0) // SEARCH_PAIRS))
+    minima = [_minimum(R, start, rays_0[some], rays_1[some], sigma) for start in (t, *DIRECTIONS)]
+    _, R, t = min(minima, key=lambda minimum: minimum[0])
+    _, R, t = _minimum(R, t, rays_0, rays_1, sigma)
+    return skew(t) @ R
 
 
-def _minimum(R: Array, t: Array, rays_0: Array, rays_1: Array, sigma: float) -> tuple[float, Array]:
-    """The cost and the essential matrix at the minimum reached from one motion, |t| = 1."""
+def _minimum(R: Array, t: Array, rays_0: Array, rays_1: Array, sigma: float) -> tuple[float, Array, Array]:
+    """The cost, R and t, |t| = 1, at the minimum reached from one motion."""
+    t = t / np.linalg.norm(t)
     across = np.linalg.svd(t[None])[2][1:].T
 
-    def essential(step: Array) -> Array:
+    def motion(step: Array) -> tuple[Array, Array]:
         moved = t + across @ step[3:]
-        return skew(moved / np.linalg.norm(moved)) @ exp_so3(step[:3]) @ R
+        return exp_so3(step[:3]) @ R, moved / np.linalg.norm(moved)
 
     def residuals(step: Array) -> Array:
-        r = sampson_distances(essential(step), rays_0, rays_1) / sigma
+        turned, moved = motion(step)
+        r = sampson_distances(skew(moved) @ turned, rays_0, rays_1) / sigma
         return np.asarray(r / np.sqrt(1.0 + r * r))
 
     found = least_squares(residuals, np.zeros(5), method="lm")
-    return float(found.cost), essential(found.x)
+    return float(found.cost), *motion(found.x)

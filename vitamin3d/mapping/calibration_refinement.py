@@ -49,6 +49,7 @@ class CalibrationRefinement:
     config: CalibrationConfig
     history: list[Refinement] = field(default_factory=list)
     _next: int = 0
+    _reads_at_once: bool = False
 
     @property
     def is_enabled(self) -> bool:
@@ -67,7 +68,8 @@ class CalibrationRefinement:
         """The camera refined with the whole map, which moves along: poses, points and ideal pixels; or the same camera."""
         self._next = int(np.ceil(self.config.growth * sparse_map.num_keyframes))
         camera = self._refine_intrinsics(sparse_map, camera)
-        return self._refine_readout(sparse_map, camera) if self.wants_image_motion and sparse_map.image_motions.any() else camera
+        is_open = self.wants_image_motion and not self._reads_at_once and bool(sparse_map.image_motions.any())
+        return self._refine_readout(sparse_map, camera) if is_open else camera
 
     def _refine_intrinsics(self, sparse_map: SparseMap, camera: Camera) -> Camera:
         window = spread_over_map(sparse_map, self.config.max_keyframes)
@@ -96,6 +98,7 @@ class CalibrationRefinement:
             reason = f"a readout of {1e3 * found.readout_s:.1f} ms is longer than the time between two frames"
         elif camera.readout_s == 0.0 and abs(found.readout_s) < self.config.significance * deviation:
             reason = "all rows were read at once"
+            self._reads_at_once = deviation <= self.config.settled_readout_deviation * interval
         believed = camera if reason else refined
         self.history.append(Refinement(sparse_map.num_keyframes, believed, {"readout_s": deviation}, not reason, reason))
         if reason:
