@@ -8,23 +8,32 @@ motion; the least of the minima wins.
 from itertools import product
 
 import numpy as np
-from scipy.optimize import least_squares
 
 from vitamin3d.geometry.se3 import exp_so3, skew
 from vitamin3d.types import Array
 
 DIRECTIONS = np.array(list(product((-1.0, 0.0, 1.0), repeat=3))[14:])
 """(13, 3): of the 26 neighbours of a cube's middle one from each opposite pair, whose essential matrices are the same."""
-
-SEARCH_PAIRS = 500
+SEARCH_PAIRS = 300
 """At most so many tell which minimum is the least; all of them refine it."""
+ITERATIONS = 12
+DIFFERENCE = 1e-6
+"""Radians, for the derivatives."""
+FIRST_DAMPING = 1e-3
 
 
 def sampson_distances(E: Array, rays_0: Array, rays_1: Array) -> Array:
-    """(N,) signed first-order distances of paired rays (N, 3) with z = 1 from x_1ᵀ E x_0 = 0, in units of the focal length."""
-    lines_1, lines_0 = rays_0 @ E.T, rays_1 @ E
-    norm = np.sqrt(lines_1[:, 0] ** 2 + lines_1[:, 1] ** 2 + lines_0[:, 0] ** 2 + lines_0[:, 1] ** 2)
-    return np.asarray((rays_1 * lines_1).sum(axis=1) / np.maximum(norm, 1e-12))
+    """Signed first-order distances of paired rays (N, 3) with z = 1 from x_1ᵀ E x_0 = 0, in units of the focal length.
+
+    Args:
+        E: (..., 3, 3) one essential matrix or many.
+
+    Returns:
+        (..., N).
+    """
+    lines_1, lines_0 = rays_0 @ np.swapaxes(E, -1, -2), rays_1 @ E
+    squared = lines_1[..., 0] ** 2 + lines_1[..., 1] ** 2 + lines_0[..., 0] ** 2 + lines_0[..., 1] ** 2
+    return np.asarray(np.einsum("ni,...ni->...n", rays_1, lines_1) / np.sqrt(np.maximum(squared, 1e-24)))
 
 
 def refine_essential(R: Array, t: Array, rays_0: Array, rays_1: Array, sigma: float) -> Array:
@@ -35,26 +44,40 @@ def refine_essential(R: Array, t: Array, rays_0: Array, rays_1: Array, sigma: fl
         rays_0, rays_1: (N, 3) paired, z = 1, N >= 5.
         sigma: scale of the cost, in units of the focal length.
     """
-    some = slice(None, None, -(-len(rays_0) // SEARCH_PAIRS))
-    minima = [_minimum(R, start, rays_0[some], rays_1[some], sigma) for start in (t, *DIRECTIONS)]
-    _, R, t = min(minima, key=lambda minimum: minimum[0])
-    _, R, t = _minimum(R, t, rays_0, rays_1, sigma)
-    return skew(t) @ R
+    some, starts = slice(None, None, -(-len(rays_0) // SEARCH_PAIRS)), np.vstack([t, DIRECTIONS])
+    rotations, translations, costs = _descended(np.repeat(R[None], len(starts), axis=0), starts, rays_0[some], rays_1[some], sigma)
+    best = [int(np.argmin(costs))]
+    rotations, translations, _ = _descended(rotations[best], translations[best], rays_0, rays_1, sigma)
+    return np.asarray(skew(translations[0]) @ rotations[0])
 
 
-def _minimum(R: Array, t: Array, rays_0: Array, rays_1: Array, sigma: float) -> tuple[float, Array, Array]:
-    """The cost, R and t, |t| = 1, at the minimum reached from one motion."""
-    t = t / np.linalg.norm(t)
-    across = np.linalg.svd(t[None])[2][1:].T
+def _descended(R: Array, t: Array, rays_0: Array, rays_1: Array, sigma: float) -> tuple[Array, Array, Array]:
+    """Levenberg–Marquardt from each of many motions, R (S, 3, 3) and t (S, 3): R, t with |t| = 1, and the costs (S,)."""
+    turns = np.stack([exp_so3(DIFFERENCE * axis) for axis in np.eye(3)])
+    t = t / np.linalg.norm(t, axis=1, keepdims=True)
+    residuals = _residuals(R, t, rays_0, rays_1, sigma)
+    costs, damping = (residuals**2).sum(axis=1), np.full(len(R), FIRST_DAMPING)
+    for _ in range(ITERATIONS):
+        across = np.linalg.svd(t[:, None])[2][:, 1:]
+        near_R = np.concatenate([turns @ R[:, None], np.repeat(R[:, None], 2, axis=1)], axis=1)
+        near_t = np.concatenate([np.repeat(t[:, None], 3, axis=1), t[:, None] + DIFFERENCE * across], axis=1)
+        J = (_residuals(near_R, near_t, rays_0, rays_1, sigma) - residuals[:, None]) / DIFFERENCE
+        H, g = J @ np.swapaxes(J, 1, 2), J @ residuals[..., None]
+        damped = H + damping[:, None, None] * H * np.eye(5) + 1e-9 * np.eye(5)
+        step = -np.linalg.solve(damped, g)[..., 0]
+        new_R = np.stack([exp_so3(omega) for omega in step[:, :3]]) @ R
+        new_t = t + np.einsum("sk,ski->si", step[:, 3:], across)
+        new_t /= np.linalg.norm(new_t, axis=1, keepdims=True)
+        new = _residuals(new_R, new_t, rays_0, rays_1, sigma)
+        better = (new**2).sum(axis=1) < costs
+        R, t = np.where(better[:, None, None], new_R, R), np.where(better[:, None], new_t, t)
+        residuals = np.where(better[:, None], new, residuals)
+        costs, damping = (residuals**2).sum(axis=1), damping * np.where(better, 0.1, 10.0)
+    return R, t, costs
 
-    def motion(step: Array) -> tuple[Array, Array]:
-        moved = t + across @ step[3:]
-        return exp_so3(step[:3]) @ R, moved / np.linalg.norm(moved)
 
-    def residuals(step: Array) -> Array:
-        turned, moved = motion(step)
-        r = sampson_distances(skew(moved) @ turned, rays_0, rays_1) / sigma
-        return np.asarray(r / np.sqrt(1.0 + r * r))
-
-    found = least_squares(residuals, np.zeros(5), method="lm")
-    return float(found.cost), *motion(found.x)
+def _residuals(R: Array, t: Array, rays_0: Array, rays_1: Array, sigma: float) -> Array:
+    """(..., N) whose squares are the Geman–McClure cost, for motions R (..., 3, 3) and t (..., 3)."""
+    E = np.cross(t[..., None, :], np.swapaxes(R, -1, -2))  # the columns of R, each turned into t × column
+    r = sampson_distances(np.swapaxes(E, -1, -2), rays_0, rays_1) / sigma
+    return np.asarray(r / np.sqrt(1.0 + r * r))
