@@ -102,6 +102,8 @@ class Slam:
             predicted = predict_by_dominant_flow(self.tracks.pixels, front.dominant_flow)
         if self.camera.readout_s or self.calibration.wants_image_motion:
             self._follow_image_motion(front.frame.timestamp_ns, predicted)
+        else:
+            self._image_motion = NO_MOTION
         return track_extrema(self.tracks, predicted, front.kappa, self.config.extrema_tracking)
 
     def _follow_image_motion(self, timestamp_ns: int, predicted: Array) -> None:

@@ -161,6 +161,7 @@ def test_a_global_shutter_is_said_to_be_one(rng):
     assert refinement.history[-1].reason == "all rows were read at once"
     assert refinement.refine(sparse_map, PINHOLE) is PINHOLE
     assert sum("readout_s" in r.deviations for r in refinement.history) == 1, "what is settled is not looked for again"
+    assert not refinement.wants_image_motion
 
 
 def test_a_readout_time_that_is_not_known_well_enough_is_looked_for_again(rng):

@@ -57,8 +57,8 @@ class CalibrationRefinement:
 
     @property
     def wants_image_motion(self) -> bool:
-        """Whether keyframes need the image's motion, from which the readout time comes."""
-        return self.is_enabled and self.config.readout
+        """Whether keyframes need the image's motion, from which the readout time comes; not once it is known to be none."""
+        return self.is_enabled and self.config.readout and not self._reads_at_once
 
     def is_due(self, num_keyframes: int) -> bool:
         """Whether the map has grown enough since the last refinement."""
@@ -68,8 +68,7 @@ class CalibrationRefinement:
         """The camera refined with the whole map, which moves along: poses, points and ideal pixels; or the same camera."""
         self._next = int(np.ceil(self.config.growth * sparse_map.num_keyframes))
         camera = self._refine_intrinsics(sparse_map, camera)
-        is_open = self.wants_image_motion and not self._reads_at_once and bool(sparse_map.image_motions.any())
-        return self._refine_readout(sparse_map, camera) if is_open else camera
+        return self._refine_readout(sparse_map, camera) if self.wants_image_motion and sparse_map.image_motions.any() else camera
 
     def _refine_intrinsics(self, sparse_map: SparseMap, camera: Camera) -> Camera:
         window = spread_over_map(sparse_map, self.config.max_keyframes)
