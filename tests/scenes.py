@@ -36,6 +36,18 @@ def project(camera, T_cam_world, points):
     return homogeneous[:, :2] / homogeneous[:, 2:]
 
 
+def two_views(T_1_0, rng, count=300, sigma_px=0.3):
+    """Points before two PINHOLE cameras, and their pixels in both, with noise."""
+    points = rng.uniform([-2, -1.5, 3], [2, 1.5, 8], (count, 3))
+    pixels_0, pixels_1 = (project(PINHOLE, T, points) + sigma_px * rng.standard_normal((count, 2)) for T in (np.eye(4), T_1_0))
+    return points, pixels_0, pixels_1
+
+
+def direction_error_deg(a, b):
+    """Between two vectors."""
+    return np.degrees(np.arccos(np.clip(a @ b / np.linalg.norm(a) / np.linalg.norm(b), -1, 1)))
+
+
 def arc_poses(count):
     """Cameras on an arc that look at (0, 0, 6), a third of a unit apart; the first is the world."""
     poses = []

@@ -57,25 +57,11 @@ def test_the_canvas_holds_all_of_the_picture_in_as_many_pixels_as_it_may_have(pi
     assert middle[0, 0] < 0.02 * canvas.width + 20 and middle[1, 0] > 0.9 * canvas.width
 
 
-@pytest.mark.parametrize("pixels", [0.3, 1.0, 9.0])
-def test_a_plane_is_the_same_on_a_canvas_of_any_size(pixels):
-    camera = reference.EUROC
+@pytest.mark.parametrize(("camera", "pixels"), [(reference.SMALL, 1.0), *((reference.EUROC, pixels) for pixels in (0.3, 1.0, 9.0))])
+def test_a_plane_comes_back_with_depth_normal_and_colour(camera, pixels):
     snapshot = reference.snapshot_of_plane(camera, NORMAL, 3000, np.random.default_rng(0))
     mesh = triangulate(snapshot, DelaunayConfig())
     renderer = DepthRenderer(camera, dataclasses.replace(CONFIG, canvas_pixels=pixels))
-    view = renderer.render(snapshot, mesh, vertex_slopes(mesh))
-    v, u = np.nonzero(view.depth)
-    expected = 1.0 / (renderer.canvas.rays_from_ideal(np.stack([u, v], axis=1).astype(float)) @ NORMAL)
-    assert len(v) > 0.5 * view.depth.size
-    np.testing.assert_allclose(view.depth[v, u], expected, rtol=1e-4)
-    np.testing.assert_allclose(view.normals_cam[v, u], np.broadcast_to(-NORMAL / np.linalg.norm(NORMAL), (len(u), 3)), atol=1e-4)
-
-
-@pytest.mark.parametrize("camera", [reference.SMALL, reference.EUROC])
-def test_a_plane_comes_back_with_depth_normal_and_colour(camera):
-    snapshot = reference.snapshot_of_plane(camera, NORMAL, 3000, np.random.default_rng(0))
-    mesh = triangulate(snapshot, DelaunayConfig())
-    renderer = DepthRenderer(camera, CONFIG)
     view = renderer.render(snapshot, mesh, vertex_slopes(mesh))
     canvas, drawn = renderer.canvas, view.depth > 0
     v, u = np.nonzero(drawn)
@@ -85,6 +71,7 @@ def test_a_plane_comes_back_with_depth_normal_and_colour(camera):
     assert (view.normals_cam[~drawn] == 0).all()
     assert view.depth.shape == (canvas.height, canvas.width) and view.depth.dtype == np.float32
     assert view.color.shape == (*view.depth.shape, 3) and (np.ptp(view.color, axis=2) == 0).all() and view.color[drawn].min() >= 49
+    assert drawn.mean() > 0.5
     assert view.timestamp_ns == 7 and drawn.sum() > 0.9 * camera.width * camera.height * (canvas.fx / camera.fx) ** 2
 
 

@@ -6,11 +6,11 @@ import pytest
 import scenes
 
 from vitamin3d.evaluation.track_statistics import (
+    epipolar_distances,
     epipolar_inlier_ratio,
     live_tracks,
     pairs_at_age,
     poses_at,
-    sampson_distances,
     survival,
     track_lengths,
     track_statistics,
@@ -92,10 +92,10 @@ def test_the_distance_is_in_pixels_and_the_same_from_both_sides(rng):
     points = rng.uniform([-1.0, -0.7, 5.0], [1.0, 0.7, 7.0], (50, 3))
     x_0, x_1 = scenes.project(camera, T_0, points), scenes.project(camera, T_1, points)
     T_1_0 = T_1 @ inverse(T_0)
-    assert sampson_distances(x_0, x_1, T_1_0, camera).max() < 1e-9
+    assert epipolar_distances(x_0, x_1, T_1_0, camera).max() < 1e-9
     lower = x_1 + np.array([0.0, 0.5])
-    forth = sampson_distances(x_0, lower, T_1_0, camera)
-    np.testing.assert_allclose(forth, sampson_distances(lower, x_0, inverse(T_1_0), camera), rtol=1e-9)
+    forth = epipolar_distances(x_0, lower, T_1_0, camera)
+    np.testing.assert_allclose(forth, epipolar_distances(lower, x_0, inverse(T_1_0), camera), rtol=1e-9)
     np.testing.assert_allclose(forth, 0.5 / np.sqrt(2.0), rtol=0.1)  # half a pixel, shared by two pictures
 
 

@@ -3,7 +3,7 @@ import dataclasses
 
 import numpy as np
 import pytest
-from scenes import PINHOLE, arc_poses, project
+from scenes import PINHOLE, arc_poses, project, two_views
 
 from vitamin3d.config import Config, InitializationConfig
 from vitamin3d.geometry.rolling_shutter import NO_MOTION
@@ -18,13 +18,8 @@ MOVING = exp_se3(np.array([-0.5, 0.05, 0.1, 0.01, 0.03, -0.02]))
 TURNING = exp_se3(np.array([0.0, 0, 0, 0.02, 0.15, 0.03]))
 
 
-def pair(T_1_0, rng, count=300, sigma_px=0.3):
-    points = rng.uniform([-2, -1.5, 3], [2, 1.5, 8], (count, 3))
-    return tuple(project(PINHOLE, T, points) + sigma_px * rng.standard_normal((count, 2)) for T in (np.eye(4), T_1_0))
-
-
 def test_a_moving_camera_is_accepted(rng):
-    attempt = initialize_from_two_views(*pair(MOVING, rng), PINHOLE, CONFIG)
+    attempt = initialize_from_two_views(*two_views(MOVING, rng)[1:], PINHOLE, CONFIG)
     assert attempt.reason == "" and not attempt.is_retry
     assert np.degrees(np.linalg.norm(log_so3(attempt.view.T_1_0[:3, :3].T @ MOVING[:3, :3]))) < 0.3
     direction = MOVING[:3, 3] / np.linalg.norm(MOVING[:3, 3])
@@ -33,14 +28,14 @@ def test_a_moving_camera_is_accepted(rng):
 
 
 def test_a_standing_camera_is_refused(rng):
-    attempt = initialize_from_two_views(*pair(np.eye(4), rng), PINHOLE, CONFIG)
+    attempt = initialize_from_two_views(*two_views(np.eye(4), rng)[1:], PINHOLE, CONFIG)
     assert attempt.view is None and not attempt.is_retry
     assert attempt.reason.startswith("no parallax: the picture moved by 0.")
 
 
 @pytest.mark.parametrize("seed", range(5))
 def test_a_turning_camera_is_refused(seed):
-    pixels = pair(TURNING, np.random.default_rng(seed))
+    pixels = two_views(TURNING, np.random.default_rng(seed))[1:]
     assert median_motion(*pixels) > 60
     attempt = initialize_from_two_views(*pixels, PINHOLE, CONFIG)
     assert attempt.view is None and not attempt.is_retry
@@ -48,7 +43,7 @@ def test_a_turning_camera_is_refused(seed):
 
 
 def test_too_few_tracks_are_refused(rng):
-    attempt = initialize_from_two_views(*pair(MOVING, rng, 99), PINHOLE, CONFIG)
+    attempt = initialize_from_two_views(*two_views(MOVING, rng, 99)[1:], PINHOLE, CONFIG)
     assert attempt.view is None and attempt.reason == "too few features: 99 tracks, 100 are needed"
     none = np.zeros((0, 2))
     assert initialize_from_two_views(none, none, PINHOLE, CONFIG).reason.startswith("too few features: 0 tracks")

@@ -182,11 +182,7 @@ class Densifier:
 
     def __init__(self, camera: Camera, canvas: Camera, config: DensificationConfig) -> None:
         self.camera, self.canvas, self.config = camera, canvas, config
-        half = 0.5 / REDUCTION - 0.5
-        self.reduced = Camera(
-            canvas.fx / REDUCTION, canvas.fy / REDUCTION, canvas.cx / REDUCTION + half, canvas.cy / REDUCTION + half,
-            canvas.width // REDUCTION, canvas.height // REDUCTION,
-        )  # fmt: skip
+        self.reduced = replace(canvas.scaled(1 / REDUCTION), width=canvas.width // REDUCTION, height=canvas.height // REDUCTION)
         self._sweep: PlaneSweep | None = None
 
     def densify(self, around: Around[CanvasPicture]) -> MapSnapshot:

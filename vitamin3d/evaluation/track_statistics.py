@@ -10,6 +10,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from vitamin3d.geometry.camera import Camera
+from vitamin3d.geometry.epipolar_refinement import sampson_distances
 from vitamin3d.geometry.se3 import inverse, skew
 from vitamin3d.scale import match_timestamps
 from vitamin3d.types import Array, Trajectory
@@ -129,13 +130,13 @@ def epipolar_inlier_ratio(
     for group in np.split(pairs, starts) if len(pairs) else []:
         a, b = frames[group[0]]
         T_b_a = inverse(T_world_cam[b]) @ T_world_cam[a]
-        distances.append(sampson_distances(ideal_pixels[group[:, 0]], ideal_pixels[group[:, 1]], T_b_a, camera))
+        distances.append(epipolar_distances(ideal_pixels[group[:, 0]], ideal_pixels[group[:, 1]], T_b_a, camera))
     found = np.concatenate(distances)
     found = found[np.isfinite(found)]
     return float((found < threshold_px).mean()) if len(found) else float("nan")
 
 
-def sampson_distances(ideal_0: Array, ideal_1: Array, T_1_0: Array, camera: Camera) -> Array:
+def epipolar_distances(ideal_0: Array, ideal_1: Array, T_1_0: Array, camera: Camera) -> Array:
     """First-order distances (N,) in pixels of pairs of ideal pixels (N, 2) from epipolar geometry; NaN without a baseline.
 
     Only the error across the epipolar line is seen: one along it looks like another depth.
@@ -145,6 +146,4 @@ def sampson_distances(ideal_0: Array, ideal_1: Array, T_1_0: Array, camera: Came
     K_inverse = np.linalg.inv(camera.K)
     F = K_inverse.T @ skew(T_1_0[:3, 3] / np.linalg.norm(T_1_0[:3, 3])) @ T_1_0[:3, :3] @ K_inverse
     x_0, x_1 = (np.column_stack([pixels, np.ones(len(pixels))]) for pixels in (ideal_0, ideal_1))
-    line_1, line_0 = x_0 @ F.T, x_1 @ F
-    slope = (line_1[:, :2] ** 2).sum(axis=1) + (line_0[:, :2] ** 2).sum(axis=1)
-    return np.asarray(np.abs((x_1 * line_1).sum(axis=1)) / np.sqrt(slope))
+    return np.abs(sampson_distances(F, x_0, x_1))

@@ -22,18 +22,18 @@ DIFFERENCE = 1e-6
 FIRST_DAMPING = 1e-3
 
 
-def sampson_distances(E: Array, rays_0: Array, rays_1: Array) -> Array:
-    """Signed first-order distances of paired rays (N, 3) with z = 1 from x_1ᵀ E x_0 = 0, in units of the focal length.
+def sampson_distances(matrix: Array, x_0: Array, x_1: Array) -> Array:
+    """Signed first-order distances of paired points (N, 3) with z = 1 from x_1ᵀ matrix x_0 = 0, in the unit of the points.
 
     Args:
-        E: (..., 3, 3) one essential matrix or many.
+        matrix: (..., 3, 3) one or many; the essential one for rays, the fundamental one for pixels.
 
     Returns:
         (..., N).
     """
-    lines_1, lines_0 = rays_0 @ np.swapaxes(E, -1, -2), rays_1 @ E
+    lines_1, lines_0 = x_0 @ np.swapaxes(matrix, -1, -2), x_1 @ matrix
     squared = lines_1[..., 0] ** 2 + lines_1[..., 1] ** 2 + lines_0[..., 0] ** 2 + lines_0[..., 1] ** 2
-    return np.asarray(np.einsum("ni,...ni->...n", rays_1, lines_1) / np.sqrt(np.maximum(squared, 1e-24)))
+    return np.asarray(np.einsum("ni,...ni->...n", x_1, lines_1) / np.sqrt(np.maximum(squared, 1e-24)))
 
 
 def refine_essential(R: Array, t: Array, rays_0: Array, rays_1: Array, sigma: float) -> Array:
@@ -69,15 +69,16 @@ def _descended(R: Array, t: Array, rays_0: Array, rays_1: Array, sigma: float) -
         new_t = t + np.einsum("sk,ski->si", step[:, 3:], across)
         new_t /= np.linalg.norm(new_t, axis=1, keepdims=True)
         new = _residuals(new_R, new_t, rays_0, rays_1, sigma)
-        better = (new**2).sum(axis=1) < costs
+        new_costs = (new**2).sum(axis=1)
+        better = new_costs < costs
         R, t = np.where(better[:, None, None], new_R, R), np.where(better[:, None], new_t, t)
         residuals = np.where(better[:, None], new, residuals)
-        costs, damping = (residuals**2).sum(axis=1), damping * np.where(better, 0.1, 10.0)
+        costs, damping = np.where(better, new_costs, costs), damping * np.where(better, 0.1, 10.0)
     return R, t, costs
 
 
 def _residuals(R: Array, t: Array, rays_0: Array, rays_1: Array, sigma: float) -> Array:
     """(..., N) whose squares are the Geman–McClure cost, for motions R (..., 3, 3) and t (..., 3)."""
-    E = np.cross(t[..., None, :], np.swapaxes(R, -1, -2))  # the columns of R, each turned into t × column
-    r = sampson_distances(np.swapaxes(E, -1, -2), rays_0, rays_1) / sigma
+    E = np.cross(t[..., None], R, axis=-2)
+    r = sampson_distances(E, rays_0, rays_1) / sigma
     return np.asarray(r / np.sqrt(1.0 + r * r))
