@@ -9,8 +9,8 @@ The steps run one after the other on one thread and are timed by that thread's C
 matters little; the processor's caches it still shares. The sparse half runs first (its scale from the ground truth, where
 there is one: the paper's voxels are 15 and 2.5 cm), then the dense half over its keyframes. In every frame KLT tracks as
 many points as are alive, forward only; at every tenth keyframe the window is also solved by the Schur complement alone. The
-volumes' time is that of fusing one view and extracting the whole surface, without colours where they cost time: the median over
-ten times in the course of the run; and "at the end" with colours.
+volumes' time is that of fusing one view and extracting the whole surface: the median over ten times in the course of the run,
+and the last time, "at the end".
 """
 
 import argparse
@@ -164,7 +164,7 @@ def run_dense(dataset: Dataset, made: Measured, config: Config, scale: Scale) ->
 def extraction_seconds(reconstruction: Reconstruction) -> float:
     """Extracts both surfaces as they are by now, timed as steps; what it took."""
     begun = time.thread_time()
-    reconstruction.surfaces_so_far(colored=False)
+    reconstruction.surfaces_so_far()
     return time.thread_time() - begun
 
 

@@ -512,6 +512,8 @@ class FusionConfig:
     """The surface ends where all views together leave a larger deviation of the depth (`blocks` alone)."""
     max_depth: float = 3.0
     """Depth beyond this many median depths of the scene is not fused."""
+    kept_megabytes: float = 500.0
+    """Of fused views, for colours and for steps of the surface (`scalable` alone); beyond it every second one is dropped."""
 
 
 @dataclass(frozen=True)

@@ -13,11 +13,12 @@ from vitamin3d.dense.delaunay import triangulate
 from vitamin3d.dense.densification import CanvasPicture, Densifier
 from vitamin3d.dense.depth_rendering import DepthRenderer
 from vitamin3d.dense.extrapolation import extended, outline
+from vitamin3d.dense.fused_views import FusedViews
 from vitamin3d.dense.neighbour_queue import Around, NeighbourQueue
 from vitamin3d.dense.nltgv import denoise
 from vitamin3d.dense.photometric_check import marked, photometrically_checked
 from vitamin3d.dense.surface_extraction import clean
-from vitamin3d.dense.tsdf_fusion import Limits, TsdfVolume, empty_surface
+from vitamin3d.dense.tsdf_fusion import Limits, TsdfVolume, certain_depth, empty_surface
 from vitamin3d.dense.view_selection import ViewSelection, view_stride
 from vitamin3d.dense.view_store import Packed, ViewStore, packed
 from vitamin3d.geometry.camera import Camera
@@ -66,6 +67,8 @@ class Reconstruction:
         self._waiting: list[DepthView] = []
         self.low: TsdfVolume | None = None
         self.high: TsdfVolume | None = None
+        fusion = config.fusion
+        self._fused_views = FusedViews(self.canvas, 1e6 * fusion.kept_megabytes) if fusion.backend == "scalable" else None
         keeps_views = keeps_views and config.refusion.enabled and config.fusion.backend == "blocks"
         self.store = ViewStore(int(1e6 * config.refusion.max_megabytes)) if keeps_views else None
 
@@ -197,15 +200,12 @@ class Reconstruction:
         self._fuse_waiting()
         return self.surfaces_so_far()
 
-    def surfaces_so_far(self, colored: bool = True) -> tuple[Surface, Surface]:
-        """The coarse and the fine surface of the keyframes that are fused; empty while the voxels are not chosen yet.
-
-        To look at in the course of a run they come sooner without colours (`TsdfVolume.extract_surface`).
-        """
+    def surfaces_so_far(self) -> tuple[Surface, Surface]:
+        """The coarse and the fine surface of the keyframes that are fused; empty while the voxels are not chosen yet."""
         with self.times.timed("surface_low"):
-            low = self._surface(self.low, colored)
+            low = self._surface(self.low)
         with self.times.timed("surface_high"):
-            high = self._surface(self.high, colored)
+            high = self._surface(self.high)
         return low, high
 
     @property
@@ -240,6 +240,9 @@ class Reconstruction:
                 kept = packed(view, max_depth)
                 self.store.add(kept)
                 view, max_depth = kept.view(), np.inf  # exactly what will be taken out again
+        if self._fused_views is not None:
+            with self.times.timed("keeping_views"):
+                self._fused_views.add(view, certain_depth(view, self.config.fusion.max_relative_deviation, max_depth))
         with self.times.timed("fusion_low"):
             self.low.integrate(view, self.canvas, max_depth)
         with self.times.timed("fusion_high"):
@@ -278,11 +281,11 @@ class Reconstruction:
     def _volume(self, voxel_length: float) -> TsdfVolume:
         fusion = self.config.fusion
         limits = Limits(fusion.max_relative_deviation, fusion.max_deviation_voxels * voxel_length)
-        return TsdfVolume(voxel_length, fusion.truncation_voxels * voxel_length, limits, fusion.backend)
+        return TsdfVolume(voxel_length, fusion.truncation_voxels * voxel_length, limits, fusion.backend, self._fused_views)
 
-    def _surface(self, volume: TsdfVolume | None, colored: bool) -> Surface:
+    def _surface(self, volume: TsdfVolume | None) -> Surface:
         if volume is None or self.high is None:
             return empty_surface()
         coarser = volume.voxel_length / self.high.voxel_length
         least = round(self.config.surface.min_component_triangles / coarser**2)
-        return clean(volume.extract_surface(colored), replace(self.config.surface, min_component_triangles=least))
+        return clean(volume.extract_surface(), replace(self.config.surface, min_component_triangles=least))

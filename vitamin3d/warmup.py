@@ -99,4 +99,3 @@ def _reconstructed(slam: Slam, frames: list[Frame], config: Config) -> None:
                 rgb_from_normals(view.normals_cam)
         fine = reconstruction.surfaces()[1]
         b"".join(obj_text(fine, [], ""))
-        reconstruction.surfaces_so_far(colored=False)

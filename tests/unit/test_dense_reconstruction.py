@@ -68,7 +68,8 @@ def test_all_steps_are_timed():
     reconstruction, _ = run(count=2)
     reconstruction.surfaces()
     counts = {step: len(times) for step, times in reconstruction.times.milliseconds.items()}
-    each = dict.fromkeys(("meshing", "denoising", "extrapolation", "rendering", "consistency", "fusion_low", "fusion_high"), 2)
+    steps = ("meshing", "denoising", "extrapolation", "rendering", "consistency", "keeping_views", "fusion_low", "fusion_high")
+    each = dict.fromkeys(steps, 2)
     assert counts == {**each, "surface_low": 1, "surface_high": 1}
 
 

@@ -35,7 +35,11 @@ class Blocks:
     weight: Array
     """(N, 512) float32."""
     shade: Array
-    """(N, 512, 3) float32."""
+    """(N, 512, C) float32: C channels of colour, 0 where there is none."""
+
+    def in_order(self) -> Array:
+        """(N,) int64: their numbers along x, then y, then z, so that what is near follows each other."""
+        return np.lexsort(self.keys.T)
 
 
 def _face_cycles() -> list[list[int]]:
@@ -99,14 +103,14 @@ def triangle_table() -> tuple[Array, Array]:
 
 
 @inlined
-def _reached(i, corner):  # type: ignore[no-untyped-def]
+def reached(i, corner):  # type: ignore[no-untyped-def]
     """Which of the eight blocks holds a corner of the cube at voxel i, and its number there."""
     x, y, z = (i & 7) + (corner & 1), (i >> 3 & 7) + (corner >> 1 & 1), (i >> 6) + (corner >> 2)
     return x >> 3 | (y >> 3) << 1 | (z >> 3) << 2, (x & 7) | (y & 7) << 3 | (z & 7) << 6
 
 
 @kernel
-def _signs(near, distance, weight, min_weight, negative, known):  # type: ignore[no-untyped-def]
+def signs(near, distance, weight, min_weight, negative, known):  # type: ignore[no-untyped-def]
     """Bits (9, 9) of the rows along x of a block and of the next voxels: where it is negative, and known."""
     for z in range(SIDE + 1):
         for y in range(SIDE + 1):
@@ -131,7 +135,8 @@ def _crossed(rows, z, y):  # type: ignore[no-untyped-def]
 
 
 @inlined
-def _known(rows, z, y):  # type: ignore[no-untyped-def]
+def known_cubes(rows, z, y):  # type: ignore[no-untyped-def]
+    """Bits of the cubes of a row all of whose voxels are known."""
     every = rows[z, y] & rows[z, y + 1] & rows[z + 1, y] & rows[z + 1, y + 1]
     return every & every >> 1 & 0xFF
 
@@ -149,10 +154,10 @@ def _find_cubes(near, distance, weight, min_weight, count, edges, codes, used): 
     negative, known = np.empty((SIDE + 1, SIDE + 1), np.int64), np.empty((SIDE + 1, SIDE + 1), np.int64)
     triangles, corners = 0, 0
     for b in range(near.shape[0]):
-        _signs(near[b], distance, weight, min_weight, negative, known)
+        signs(near[b], distance, weight, min_weight, negative, known)
         for z in range(SIDE):
             for y in range(SIDE):
-                cubes = _known(known, z, y) & _crossed(negative, z, y)
+                cubes = known_cubes(known, z, y) & _crossed(negative, z, y)
                 x = 0
                 while cubes >> x:
                     if cubes >> x & 1:
@@ -161,7 +166,7 @@ def _find_cubes(near, distance, weight, min_weight, count, edges, codes, used): 
                         triangles += count[code]
                         for t in range(count[code]):
                             for k in range(3):
-                                which, j = _reached(i, edges[code, t, k] // 3)
+                                which, j = reached(i, edges[code, t, k] // 3)
                                 bit, at = 1 << edges[code, t, k] % 3, near[b, which]
                                 corners += (used[at, j] & bit) == 0
                                 used[at, j] |= bit
@@ -171,17 +176,17 @@ def _find_cubes(near, distance, weight, min_weight, count, edges, codes, used): 
 
 @kernel
 def _place_corners(order, keys, near, distance, shade, voxel, used, first, vertices, colors):  # type: ignore[no-untyped-def]
-    """Corners of the surface, linear between voxels; `first` (N, 512) is the number of a voxel's first one."""
-    n = 0
+    """Corners of the surface, linear between voxels; `first` (N, 512) is the number of a voxel's first one, where it has any."""
+    n, rows = 0, used.view(np.uint64)
     for b in order:
         for i in range(VOXELS):
-            first[b, i] = n
-            if used[b, i] == 0:
+            if rows[b, i >> 3] == 0 or used[b, i] == 0:
                 continue
+            first[b, i] = n
             for axis in range(3):
                 if not used[b, i] >> axis & 1:
                     continue
-                which, j = _reached(i, 1 << axis)
+                which, j = reached(i, 1 << axis)
                 at = near[b, which]
                 here, there = np.float64(distance[b, i]), np.float64(distance[at, j])
                 share = here / (here - there)
@@ -189,21 +194,23 @@ def _place_corners(order, keys, near, distance, shade, voxel, used, first, verti
                 vertices[n, 0] = (keys[b, 0] * SIDE + x + (share if axis == 0 else 0.0)) * voxel
                 vertices[n, 1] = (keys[b, 1] * SIDE + y + (share if axis == 1 else 0.0)) * voxel
                 vertices[n, 2] = (keys[b, 2] * SIDE + z + (share if axis == 2 else 0.0)) * voxel
-                for c in range(3):
+                for c in range(shade.shape[2]):
                     colors[n, c] = (1.0 - share) * shade[b, i, c] + share * shade[at, j, c]
                 n += 1
 
 
 @kernel
 def _join(order, near, codes, count, edges, used, first, triangles):  # type: ignore[no-untyped-def]
-    n = 0
+    n, rows = 0, codes.view(np.uint64)
     for b in order:
         for i in range(VOXELS):
+            if rows[b, i >> 3] == 0:
+                continue
             code = codes[b, i]
             for t in range(count[code]):
                 for k in range(3):
                     edge = edges[code, t, k]
-                    which, j = _reached(i, edge // 3)
+                    which, j = reached(i, edge // 3)
                     at, v = near[b, which], 0
                     for axis in range(edge % 3):
                         v += used[at, j] >> axis & 1
@@ -212,7 +219,7 @@ def _join(order, near, codes, count, edges, used, first, triangles):  # type: ig
 
 
 def zero_level(blocks: Blocks, min_weight: float, voxel_length: float) -> tuple[Array, Array, Array]:
-    """Vertices (V, 3) float64, triangles (F, 3) int32 facing the positive side, and colours (V, 3) float32 of the surface.
+    """Vertices (V, 3) float64, triangles (F, 3) int32 facing the positive side, and colours (V, C) float32 of the surface.
 
     Only cubes whose voxels all have a weight of at least `min_weight` have a part in it. The order depends on places alone.
     """
@@ -221,8 +228,8 @@ def zero_level(blocks: Blocks, min_weight: float, voxel_length: float) -> tuple[
     count, edges = triangle_table()
     weights = (blocks.weight, np.float32(min_weight))
     num_triangles, num_vertices = _find_cubes(blocks.near, blocks.distance, *weights, count, edges, codes, used)
-    vertices, colors = np.empty((num_vertices, 3)), np.empty((num_vertices, 3), np.float32)
-    triangles, order = np.empty((num_triangles, 3), np.int32), np.lexsort(blocks.keys.T)
+    vertices, colors = np.empty((num_vertices, 3)), np.empty((num_vertices, blocks.shade.shape[2]), np.float32)
+    triangles, order = np.empty((num_triangles, 3), np.int32), blocks.in_order()
     _place_corners(order, blocks.keys, blocks.near, blocks.distance, blocks.shade, voxel_length, used, first, vertices, colors)
     _join(order, blocks.near, codes, count, edges, used, first, triangles)
     return vertices, triangles, colors

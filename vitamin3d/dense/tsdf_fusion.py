@@ -9,7 +9,8 @@ import numpy as np
 
 from vitamin3d._jit import kernel
 from vitamin3d.dense.block_volume import BlockVolume
-from vitamin3d.dense.voxel_cloud import shape_of
+from vitamin3d.dense.fused_views import FusedViews
+from vitamin3d.dense.voxel_cloud import surface_of
 from vitamin3d.errors import DependencyError, InputError
 from vitamin3d.geometry.camera import Camera
 from vitamin3d.types import Array, DepthView, Surface
@@ -18,9 +19,6 @@ BLOCK_RESOLUTION = 16
 """Voxels along the side of a block; all backends allocate by blocks."""
 ALLOCATION_STRIDE = 8
 """Open3D's volume allocates for every so many-th pixel in both directions; a fine block is some hundred of them wide."""
-
-GREY = 0.6
-"""Of a surface without colours."""
 
 
 @dataclass(frozen=True)
@@ -42,18 +40,23 @@ class TsdfVolume:
         limits: what is too uncertain to be fused.
         backend: `scalable` (Open3D's ScalableTSDFVolume), `voxel_block_grid` (its tensor twin) or `blocks` (ours; every pixel
             has its weight, in the others all weigh the same).
+        views: for `scalable`: what is integrated is kept there too, by the caller. The surface is then had from both, in less
+            time, and the volume has no colours of its own.
 
     Raises:
         InputError: no such backend.
         DependencyError: the installed Open3D fuses nothing.
     """
 
-    def __init__(self, voxel_length: float, truncation: float, limits: Limits, backend: str = "scalable") -> None:
+    def __init__(
+        self, voxel_length: float, truncation: float, limits: Limits, backend: str = "scalable", views: FusedViews | None = None
+    ) -> None:
         if backend not in BACKENDS:
             raise InputError(f"fusion.backend must be one of {', '.join(BACKENDS)}, not {backend!r}")
         check_backend(backend)
         self.voxel_length = voxel_length
-        self._volume = BACKENDS[backend](voxel_length, truncation, limits)
+        sides = (voxel_length, truncation, limits)
+        self._volume: _Backend = BACKENDS[backend](*sides) if views is None else _ScalableVolume(*sides, views)
 
     def integrate(self, view: DepthView, canvas: Camera, max_depth: float) -> None:
         """Averages a view, drawn on `canvas`, into the volume; depths beyond `max_depth` (map units) are left out."""
@@ -79,12 +82,9 @@ class TsdfVolume:
         """Blocks in use and bytes of them all; None where Open3D does not say."""
         return self._volume.size()
 
-    def extract_surface(self, colored: bool = True) -> Surface:
-        """The zero level (marching cubes), triangles facing the cameras; vertex normals are not filled in yet (zero).
-
-        Without colours `scalable` takes less than half the time: `shape_of`; the others know them anyway.
-        """
-        return self._volume.extract_surface(colored)
+    def extract_surface(self) -> Surface:
+        """The zero level (marching cubes), triangles facing the cameras; vertex normals are not filled in yet (zero)."""
+        return self._volume.extract_surface()
 
 
 class _Backend(Protocol):
@@ -92,22 +92,23 @@ class _Backend(Protocol):
 
     def integrate(self, view: DepthView, canvas: Camera, max_depth: float) -> None: ...
 
-    def extract_surface(self, colored: bool) -> Surface: ...
+    def extract_surface(self) -> Surface: ...
 
     def size(self) -> dict[str, int] | None: ...
 
 
 class _ScalableVolume:
-    """Open3D's ScalableTSDFVolume."""
+    """Open3D's ScalableTSDFVolume; with views that are kept beside it its surface and the colours come from them too."""
 
-    def __init__(self, voxel_length: float, truncation: float, limits: Limits) -> None:
+    def __init__(self, voxel_length: float, truncation: float, limits: Limits, views: FusedViews | None = None) -> None:
         import open3d as o3d
 
-        self._voxel_length, self._limits = voxel_length, limits
+        self._voxel_length, self._truncation, self._limits, self._views = voxel_length, truncation, limits, views
+        colors = o3d.pipelines.integration.TSDFVolumeColorType
         self._volume = o3d.pipelines.integration.ScalableTSDFVolume(
             voxel_length=voxel_length,
             sdf_trunc=truncation,
-            color_type=o3d.pipelines.integration.TSDFVolumeColorType.RGB8,
+            color_type=colors.RGB8 if views is None else colors.NoColor,
             volume_unit_resolution=BLOCK_RESOLUTION,
             depth_sampling_stride=ALLOCATION_STRIDE,
         )
@@ -116,7 +117,8 @@ class _ScalableVolume:
         import open3d as o3d
 
         rgbd = o3d.geometry.RGBDImage()
-        rgbd.color = o3d.geometry.Image(np.ascontiguousarray(view.color))
+        if self._views is None:
+            rgbd.color = o3d.geometry.Image(np.ascontiguousarray(view.color))
         rgbd.depth = o3d.geometry.Image(certain_depth(view, self._limits.relative_deviation, max_depth))
         pinhole = o3d.camera.PinholeCameraIntrinsic(canvas.width, canvas.height, canvas.fx, canvas.fy, canvas.cx, canvas.cy)
         self._volume.integrate(rgbd, pinhole, view.T_cam_world)
@@ -124,10 +126,9 @@ class _ScalableVolume:
     def size(self) -> dict[str, int] | None:
         return None
 
-    def extract_surface(self, colored: bool) -> Surface:
-        if not colored:
-            vertices, triangles = shape_of(self._volume, self._voxel_length)
-            return _surface(vertices, triangles, np.full_like(vertices, GREY))
+    def extract_surface(self) -> Surface:
+        if self._views is not None:
+            return surface_of(self._volume, self._voxel_length, self._truncation, self._views)
         mesh = self._volume.extract_triangle_mesh()
         return _surface(np.asarray(mesh.vertices), np.asarray(mesh.triangles), np.asarray(mesh.vertex_colors))
 
@@ -163,7 +164,7 @@ class _VoxelBlockGrid:
         blocks, bytes_per_voxel = int(self._grid.hashmap().size()), 4 * (1 + 1 + 3)
         return {"blocks": blocks, "bytes": bytes_per_voxel * BLOCK_RESOLUTION**3 * int(self._grid.hashmap().capacity())}
 
-    def extract_surface(self, colored: bool) -> Surface:
+    def extract_surface(self) -> Surface:
         if self._grid.hashmap().size() == 0:
             return empty_surface()
         mesh = self._grid.extract_triangle_mesh(weight_threshold=0.5)
@@ -187,7 +188,7 @@ class _WeightedBlocks:
     def size(self) -> dict[str, int] | None:
         return {"blocks": self._volume.num_blocks, "bytes": self._volume.num_bytes}
 
-    def extract_surface(self, colored: bool) -> Surface:
+    def extract_surface(self) -> Surface:
         return _surface(*self._volume.extract())
 
 
@@ -232,7 +233,7 @@ def check_backend(backend: str) -> None:
     depth, normals, color = np.ones((40, 40), np.float32), np.zeros((40, 40, 3), np.float32), np.full((40, 40, 3), 128, np.uint8)
     volume = BACKENDS[backend](0.04, 0.16, Limits(10.0, 10.0))
     volume.integrate(DepthView(0, np.eye(4), depth, normals, color, np.ones_like(depth)), canvas, 2.0)
-    if not _is_plane_at_one(volume.extract_surface(True).vertices_world):
+    if not _is_plane_at_one(volume.extract_surface().vertices_world):
         import open3d as o3d
 
         raise DependencyError(f"Open3D {o3d.__version__} ({backend}) fuses nothing; install 0.19 (`pip install 'open3d<0.20'`)")

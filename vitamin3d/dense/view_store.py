@@ -60,14 +60,15 @@ def packed(view: DepthView, max_depth: float = np.inf) -> Packed:
     depth_codes, depth_steps, middle = _encoded(depth, depth, limit)
     weight_codes, weight_steps, _ = _encoded(weights, depth, limit)
     color = np.ascontiguousarray(view.color)
-    channels = 1 if _is_grey(color) else 3
+    channels = 1 if is_grey(color) else 3
     data = depth_codes.tobytes() + weight_codes.tobytes() + np.ascontiguousarray(color[..., :channels]).tobytes()
     height, width = depth.shape
     return Packed(view.timestamp_ns, view.T_cam_world, (height, width), depth_steps, weight_steps, middle, channels, data)
 
 
 @kernel
-def _is_grey(color):  # type: ignore[no-untyped-def]
+def is_grey(color):  # type: ignore[no-untyped-def]
+    """Whether the three channels of a picture (H, W, 3) are the same."""
     for v in range(color.shape[0]):
         for u in range(color.shape[1]):
             if color[v, u, 0] != color[v, u, 1] or color[v, u, 1] != color[v, u, 2]:
