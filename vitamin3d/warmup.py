@@ -27,6 +27,7 @@ NUM_FRAMES, PIXELS_PER_FRAME = 70, 5.0
 DARK_FRAME = 60
 """After it the camera must be found again."""
 PERIOD_NS = 50_000_000
+SMALL_WINDOW = 5
 Tell = Callable[[int, int, str], None]
 """Hears how many parts are done, of how many, and what comes next."""
 
@@ -83,6 +84,8 @@ def _everything(config: Config) -> Config:
 
 
 def _tracked(frames: list[Frame], config: Config) -> Slam:
+    """With a window of few keyframes, so that older ones anchor it."""
+    config = dataclasses.replace(config, window=dataclasses.replace(config.window, keyframes=min(SMALL_WINDOW, config.window.keyframes)))
     slam, front_end = Slam(relief_camera(), config), FrontEnd(config)
     for frame in frames:
         slam.process_frame(front_end.process(frame))

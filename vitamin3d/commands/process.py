@@ -9,9 +9,9 @@ from types import ModuleType
 EXIT_BROKEN, EXIT_ERROR, EXIT_NO_MAP, EXIT_INTERRUPTED = 1, 2, 3, 130
 UNUSED_PARTS_OF_OPEN3D = ("open3d.ml", "open3d.visualization.draw_plotly")
 ONE_THREAD_EACH = ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS")
-M_TRIM_THRESHOLD, M_MMAP_THRESHOLD = -1, -3
+M_TRIM_THRESHOLD, M_MMAP_MAX = -1, -4
 """Of malloc.h."""
-KEPT_BLOCK_BYTES, KEPT_BYTES = 32 << 20, 256 << 20
+KEPT_BYTES = 256 << 20
 
 
 def prepare() -> None:
@@ -33,7 +33,7 @@ def keep_freed_memory() -> None:
     (800 page faults a frame, a fifth of the front end's time). Elsewhere it does nothing."""
     mallopt = getattr(ctypes.CDLL(None), "mallopt", None) if sys.platform == "linux" else None
     if mallopt is not None:
-        mallopt(M_MMAP_THRESHOLD, KEPT_BLOCK_BYTES)
+        mallopt(M_MMAP_MAX, 0)
         mallopt(M_TRIM_THRESHOLD, KEPT_BYTES)
 
 

@@ -61,11 +61,14 @@ def _find_around(triangles, is_known, around):  # type: ignore[no-untyped-def]
 @kernel
 def _fill(points, values, voxel, table, keys, distance, weight):  # type: ignore[no-untyped-def]
     """Sorts voxels (N, 3), given by their middles, into blocks; how many blocks, -1 where there are more than the arrays hold."""
-    count = 0
+    count, before, b = 0, EMPTY, EMPTY
     for n in range(points.shape[0]):
         x, y, z = int(np.floor(points[n, 0] / voxel)), int(np.floor(points[n, 1] / voxel)), int(np.floor(points[n, 2] / voxel))
         bx, by, bz = x // SIDE, y // SIDE, z // SIDE
-        b, count = block_at(table, key_of(bx, by, bz), bx, by, bz, keys, count)
+        key = key_of(bx, by, bz)
+        if key != before:  # mostly it is the block of the last voxel
+            b, count = block_at(table, key, bx, by, bz, keys, count)
+            before = key
         if b == EMPTY:
             return -1
         i = x % SIDE + SIDE * (y % SIDE) + SIDE * SIDE * (z % SIDE)
