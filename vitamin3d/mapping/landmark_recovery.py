@@ -70,31 +70,33 @@ def patch_similarity(a: Array, b: Array) -> Array:
 
 @kernel
 def _list_candidates(  # type: ignore[no-untyped-def]
-    points, num_observations, last_observation, is_live, keyframe_starts, poses, pose, view, min_observations, min_cosine, max_ratio, ids
+    points, num_observations, last_observation, is_live, keyframe_starts, centres, pose, view, min_observations, min_cosine, max_ratio, ids
 ):
-    """Writes the ids of landmarks that `_visible_candidates` is about, and returns how many; `view` is fx fy cx cy width height."""
+    """Writes the ids of landmarks that `_visible_candidates` is about, and returns how many; `view` is fx fy cx cy width height,
+    `centres` (K + 1, 3) those of the keyframes' cameras and of this one in the world."""
     fx, fy, cx, cy, width, height = view
-    count = 0
-    for p in range(points.shape[0]):
-        if is_live[p] or num_observations[p] < min_observations or np.isnan(points[p, 0]):
-            continue
-        x, y, z = points[p]
+    count, here = 0, centres[-1]
+    for p in range(points.shape[0]):  # without a branch; NaN is not in the picture
+        x, y, z = points[p, 0], points[p, 1], points[p, 2]
         depth = pose[2, 0] * x + pose[2, 1] * y + pose[2, 2] * z + pose[2, 3]
         u = fx * (pose[0, 0] * x + pose[0, 1] * y + pose[0, 2] * z + pose[0, 3]) + cx * depth
         v = fy * (pose[1, 0] * x + pose[1, 1] * y + pose[1, 2] * z + pose[1, 3]) + cy * depth
-        if not (depth > 0.0 and u > 0.0 and v > 0.0 and u < width * depth and v < height * depth):
-            continue
-        then = poses[np.searchsorted(keyframe_starts, last_observation[p], side="right") - 1]
+        is_shown = (depth > 0.0) & (u > 0.0) & (v > 0.0) & (u < width * depth) & (v < height * depth)
+        ids[count] = p
+        count += is_shown & (not is_live[p]) & (num_observations[p] >= min_observations)
+    shown, count = ids[:count], 0
+    for p in shown:
+        k, span = 0, keyframe_starts.shape[0]  # the keyframe of the last observation, by bisection without a branch
+        while span > 1:
+            half = span >> 1
+            k += half * (keyframe_starts[k + half] <= last_observation[p])
+            span -= half
         dot, squared_then, squared_now = 0.0, 0.0, 0.0
         for i in range(3):
-            a, b = 0.0, 0.0
-            for m in range(3):
-                a += then[m, i] * (then[m, 0] * x + then[m, 1] * y + then[m, 2] * z + then[m, 3])
-                b += pose[m, i] * (pose[m, 0] * x + pose[m, 1] * y + pose[m, 2] * z + pose[m, 3])
+            a, b = points[p, i] - centres[k, i], points[p, i] - here[i]
             dot, squared_then, squared_now = dot + a * b, squared_then + a * a, squared_now + b * b
-        if not dot > min_cosine * np.sqrt(squared_then * squared_now):
-            continue
-        if squared_now < max_ratio**2 * squared_then and squared_then < max_ratio**2 * squared_now:
+        is_alike = dot > min_cosine * np.sqrt(squared_then * squared_now)
+        if is_alike and squared_now < max_ratio**2 * squared_then and squared_then < max_ratio**2 * squared_now:
             ids[count] = p
             count += 1
     return count
@@ -106,9 +108,11 @@ def _visible_candidates(sparse_map: SparseMap, live_ids: Array, T_cam_world: Arr
     view = camera.fx, camera.fy, canvas.cx, canvas.cy, canvas.width, canvas.height
     is_live, ids = np.zeros(size, np.bool_), np.empty(size, np.int64)
     is_live[live_ids[live_ids < size]] = True
+    poses = np.concatenate([sparse_map.T_cam_world, T_cam_world[None]])
+    centres = -np.einsum("kji,kj->ki", poses[:, :3, :3], poses[:, :3, 3])
     count = _list_candidates(
         sparse_map.points_world, sparse_map.num_observations, sparse_map.last_observation, is_live, np.array(sparse_map.keyframe_starts),
-        sparse_map.T_cam_world, np.ascontiguousarray(T_cam_world), view,
+        centres, np.ascontiguousarray(T_cam_world), view,
         config.min_observations, np.cos(np.radians(config.max_view_angle_deg)), config.max_distance_ratio, ids,
     )  # fmt: skip
     return ids[:count]
