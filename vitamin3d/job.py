@@ -172,7 +172,7 @@ class _JobRun:
         stats |= {"source": self.dataset.name, "mode": self.job.config.mode, "voxels": dense.voxels(), "volumes": dense.volumes()}
         stats |= {"empty_meshes": dense.empty_meshes}
         stats |= {"skipped": [_line(s) for s in self.record.skipped], "failure": str(failure) if failure else None}
-        stats |= {"live": live_table(self.record, dense.mesh_lags) if self.job.live else None}
+        stats |= {"live": live_table(self.record, dense.mesh_lags, dense.mesh_begins) if self.job.live else None}
         self.output.write_stats(stats)
         write_report(self.output.path, self.dataset, self.slam, self.record)
         return Outcome(self.slam, self.record, scale, stats)
@@ -240,6 +240,8 @@ class _Dense:
         """Names of those that were asked for and have no triangle; they are not written."""
         self.mesh_lags: list[float] = []
         """Seconds from when a keyframe's picture was due until it was in the volume; where there is a clock."""
+        self.mesh_begins: float | None = None
+        """The same of the first keyframe; it, and those fused together with it, had to wait for the choice of the voxels."""
 
     def add(self, snapshot: MapSnapshot) -> None:
         """Takes a keyframe; fuses those that are ready and writes their maps."""
@@ -259,11 +261,19 @@ class _Dense:
     def _fuse(self, view: DepthView) -> None:
         """Fuses a view and writes its maps."""
         with step(f"fusing the view of {view.timestamp_ns / 1e9:.3f} s"):
-            self._begun().fuse(view)
-        if self.clock is not None:
-            self.mesh_lags.append(self.clock.seconds_since(view.timestamp_ns))
+            fused = self._begun().fuse(view)
+        self._note_lags(fused)
         with step("writing depth and normal maps"):
             self.output.write_view(view, self.scale)
+
+    def _note_lags(self, fused: list[DepthView]) -> None:
+        if self.clock is None or not fused:
+            return
+        lags = [self.clock.seconds_since(view.timestamp_ns) for view in fused]
+        if self.mesh_begins is None:
+            self.mesh_begins = max(lags)
+        else:
+            self.mesh_lags += lags
 
     def _beside(self, threads: ExitStack, name: str, source: Iterator[Any], upstream: Closable | None) -> Iterable[Any]:
         """The items of a generator, computed on a thread of its own where there are any; in live runs just one ahead."""

@@ -187,12 +187,12 @@ class Reconstruction:
         photometric = self.config.photometric
         return marked(view, mesh, self.renderer, photometric) if photometric.enabled else view
 
-    def fuse(self, view: DepthView) -> None:
-        """Integrates a view into both volumes, as soon as the voxels can be chosen."""
+    def fuse(self, view: DepthView) -> list[DepthView]:
+        """Integrates a view into both volumes, as soon as the voxels can be chosen; the views that are in them since now."""
         self.median_depths.append(_median_depth(view))
         self._waiting.append(dataclasses.replace(view, normals_cam=NO_NORMALS))
-        if self._voxels_are_known or len(self._waiting) >= self.config.fusion.keyframes_for_depth:
-            self._fuse_waiting()
+        is_due = self._voxels_are_known or len(self._waiting) >= self.config.fusion.keyframes_for_depth
+        return self._fuse_waiting() if is_due else []
 
     def surfaces(self) -> tuple[Surface, Surface]:
         """The coarse and the fine surface of all keyframes so far, those that still waited for neighbours included."""
@@ -225,11 +225,12 @@ class Reconstruction:
         fusion = self.config.fusion
         return self.low is not None or (fusion.voxel_low is not None and fusion.voxel_high is not None)
 
-    def _fuse_waiting(self) -> None:
-        """Fuses the keyframes that waited until enough of the scene was seen to choose the voxels by its depth."""
-        for view in self._waiting:
+    def _fuse_waiting(self) -> list[DepthView]:
+        """Fuses the views that waited until enough of the scene was seen to choose the voxels by its depth."""
+        views, self._waiting = self._waiting, []
+        for view in views:
             self._fuse(view)
-        self._waiting.clear()
+        return views
 
     def _fuse(self, view: DepthView) -> None:
         if self.low is None or self.high is None:

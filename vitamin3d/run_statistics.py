@@ -77,11 +77,12 @@ def _camera_table(camera: Camera) -> dict[str, float]:
 LATE_MS = 50.0
 
 
-def live_table(record: RunRecord, mesh_lags: list[float]) -> dict[str, Any]:
+def live_table(record: RunRecord, mesh_lags: list[float], mesh_begins: float | None = None) -> dict[str, Any]:
     """What a live run left out; and with a clock what came late.
 
     A frame's latency is the time from when its picture was due until its pose was there; it is late where that took longer
-    than LATE_MS. A mesh's lag is the time until the keyframe's view was in the volume.
+    than LATE_MS. A mesh's lag is the time until the keyframe's view was in the volume; the first views wait there for the choice of
+    the voxels, and `mesh_begins` is the lag of the very first.
     """
     table: dict[str, Any] = {
         "keyframes_offered": record.keyframes_offered,
@@ -94,6 +95,7 @@ def live_table(record: RunRecord, mesh_lags: list[float]) -> dict[str, Any]:
             "latency_ms": _spread(milliseconds),
             "late_frames": [[index, round(1e3 * seconds, 1)] for index, seconds in record.latencies if 1e3 * seconds > LATE_MS],
             "late_share": round(float((milliseconds > LATE_MS).mean()), 6),
+            "mesh_begins_seconds": None if mesh_begins is None else round(mesh_begins, 3),
             "mesh_lag_seconds": _spread(np.array(mesh_lags)) if mesh_lags else None,
         }
     return table

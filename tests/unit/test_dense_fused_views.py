@@ -100,6 +100,12 @@ def test_every_second_view_is_dropped_where_there_is_no_room(rng):
         np.testing.assert_array_equal(packed.color[..., 0], view.color[..., 0])
 
 
+def test_a_view_without_depth_sees_nothing(rng):
+    view = random_view(rng, True)
+    view.depth[...] = 0.0
+    assert not kept([view]).seen(np.array([[0.0], [0.0], [1.0]], np.float32), TRUNCATION).is_seen.any()
+
+
 def test_no_views_see_nothing():
     seen = FusedViews(CAMERA, MUCH).seen(np.zeros((3, 10), np.float32), TRUNCATION)
     assert not seen.is_seen.any() and not seen.colors.any()

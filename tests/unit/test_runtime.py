@@ -3,6 +3,7 @@ import dataclasses
 import threading
 import time
 from pathlib import Path
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -10,7 +11,10 @@ import pytest
 from vitamin3d.config import Config, WindowConfig
 from vitamin3d.datasets.pictures import Unreadable
 from vitamin3d.errors import WorkerError
+from vitamin3d.job import Job, _Dense
+from vitamin3d.run_statistics import live_table
 from vitamin3d.runtime import RunRecord, SilentObserver, median_of, run_live, run_sequential, run_threaded
+from vitamin3d.scale import Scale
 from vitamin3d.slam import Slam
 from vitamin3d.tracking.front_end import FrontEnd
 from vitamin3d.types import MapSnapshot, NewestFrame, SlamState
@@ -283,3 +287,17 @@ def test_a_stop_does_not_wait_for_the_next_picture(demo):
     with pytest.raises(KeyboardInterrupt):
         run_live(Rare(), range(3), FrontEnd(CONFIG), Slam(demo.camera, CONFIG), observer=StopsSoon(), clock=Clock())
     assert time.monotonic() - begun < 20
+
+
+def test_lags_count_from_when_a_view_is_in_the_volume():
+    """The first three wait for the choice of the voxels; how long is a figure of its own."""
+    clock = SimpleNamespace(seconds_since=lambda timestamp_ns: 10.0 - timestamp_ns / 1e9)
+    dense = _Dense(SimpleNamespace(camera=None), Job(Config()), None, Scale(), clock)
+    first, later = ([SimpleNamespace(timestamp_ns=int(1e9 * t)) for t in times] for times in ((5.0, 6.0, 7.0), (8.5,)))
+    for fused in ([], [], first, later):
+        dense._note_lags(fused)
+    assert dense.mesh_begins == 5.0 and dense.mesh_lags == [1.5]
+    record = RunRecord(latencies=[(0, 0.01), (1, 0.07)])
+    table = live_table(record, dense.mesh_lags, dense.mesh_begins)["realtime"]
+    assert table["mesh_begins_seconds"] == 5.0 and table["mesh_lag_seconds"]["worst"] == 1.5
+    assert table["late_frames"] == [[1, 70.0]] and table["late_share"] == 0.5

@@ -192,4 +192,7 @@ def _live_line(live: dict[str, Any]) -> str:
         return line
     late, lag = live["realtime"], live["realtime"]["mesh_lag_seconds"]
     line += f"; {len(late['late_frames'])} frames late ({100 * late['late_share']:.1f} %), the worst {late['latency_ms']['worst']:.0f} ms"
-    return line + (f"; the mesh {lag['median']:.1f} s behind the camera, at most {lag['worst']:.1f} s" if lag else "")
+    if lag:
+        line += f"; the mesh began after {late['mesh_begins_seconds']:.1f} s"
+        line += f", then {lag['median']:.1f} s behind the camera, at most {lag['worst']:.1f} s"
+    return line

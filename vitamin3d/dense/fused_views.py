@@ -102,7 +102,7 @@ class FusedViews:
 
 def _packed(view: DepthView, depth: Array) -> _Kept:
     codes, color = np.empty(depth.shape, np.uint16), np.ascontiguousarray(view.color)
-    step = max(float(depth.max()), np.finfo(np.float32).tiny) / CODES
+    step = float(depth.max()) / CODES or 1.0
     _encode(depth.ravel(), np.float32(1.0 / step), codes.ravel())
     color = color[..., :1].copy() if is_grey(color) else color
     return _Kept(np.ascontiguousarray(view.T_cam_world[:3], np.float32), codes, step, color)
