@@ -69,7 +69,7 @@ class Reconstruction:
         self.high: TsdfVolume | None = None
         fusion = config.fusion
         self._fused_views = FusedViews(self.canvas, 1e6 * fusion.kept_megabytes) if fusion.backend == "scalable" else None
-        keeps_views = keeps_views and config.refusion.enabled and config.fusion.backend == "blocks"
+        keeps_views = keeps_views and config.refusion.enabled and fusion.backend == "blocks"
         self.store = ViewStore(int(1e6 * config.refusion.max_megabytes)) if keeps_views else None
 
     @property

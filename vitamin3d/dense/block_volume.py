@@ -178,6 +178,11 @@ def _integrate(depth, pixel_weights, color, camera, R, t, voxel, truncation, max
                 shade[b, i, c] += share * (np.float32(colors[p, c]) - shade[b, i, c])
 
 
+def pixel_camera(canvas: Camera) -> Array:
+    """(4,) float32: focal lengths, and the centre moved by half a pixel, so that rounding down gives the pixel of a projection."""
+    return np.array([canvas.fx, canvas.fy, canvas.cx + 0.5, canvas.cy + 0.5], np.float32)
+
+
 class BlockVolume:
     """Blocks of 8³ voxels near the surface, found through a hash table; memory grows with the area of the surface.
 
@@ -210,7 +215,7 @@ class BlockVolume:
 
     def _add(self, view: DepthView, canvas: Camera, max_depth: float, sign: float) -> None:
         touched = self._touched(view, canvas, max_depth)
-        camera = np.array([canvas.fx, canvas.fy, canvas.cx + 0.5, canvas.cy + 0.5], np.float32)
+        camera = pixel_camera(canvas)
         R, t = np.ascontiguousarray(view.T_cam_world[:3, :3]), np.ascontiguousarray(view.T_cam_world[:3, 3])
         _integrate(
             view.depth, view.weights, view.color, camera, R, t, self.voxel_length, self.truncation, np.float32(max_depth),

@@ -6,6 +6,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from vitamin3d._jit import inlined, kernel
+from vitamin3d.dense.block_volume import pixel_camera
 from vitamin3d.dense.view_store import is_grey
 from vitamin3d.geometry.camera import Camera
 from vitamin3d.types import Array, DepthView
@@ -59,7 +60,7 @@ class FusedViews:
     """
 
     def __init__(self, canvas: Camera, max_bytes: float) -> None:
-        self._camera = np.array([canvas.fx, canvas.fy, canvas.cx + 0.5, canvas.cy + 0.5], np.float32)
+        self._camera = pixel_camera(canvas)
         self._max_bytes = max_bytes
         self._kept: list[_Kept] = []
         self._num_added, self._stride = 0, 1

@@ -176,13 +176,13 @@ def _find_cubes(near, distance, weight, min_weight, count, edges, codes, used): 
 
 @kernel
 def _place_corners(order, keys, near, distance, shade, voxel, used, first, vertices, colors):  # type: ignore[no-untyped-def]
-    """Corners of the surface, linear between voxels; `first` (N, 512) is the number of a voxel's first one, where it has any."""
-    n, rows = 0, used.view(np.uint64)
+    """Corners of the surface, linear between voxels; `first` (N, 512) is the number of a voxel's first one."""
+    n = 0
     for b in order:
         for i in range(VOXELS):
-            if rows[b, i >> 3] == 0 or used[b, i] == 0:
-                continue
             first[b, i] = n
+            if used[b, i] == 0:
+                continue
             for axis in range(3):
                 if not used[b, i] >> axis & 1:
                     continue
@@ -201,11 +201,9 @@ def _place_corners(order, keys, near, distance, shade, voxel, used, first, verti
 
 @kernel
 def _join(order, near, codes, count, edges, used, first, triangles):  # type: ignore[no-untyped-def]
-    n, rows = 0, codes.view(np.uint64)
+    n = 0
     for b in order:
         for i in range(VOXELS):
-            if rows[b, i >> 3] == 0:
-                continue
             code = codes[b, i]
             for t in range(count[code]):
                 for k in range(3):

@@ -9,7 +9,7 @@ from vitamin3d._jit import kernel
 from vitamin3d.dense.block_volume import FIRST_BLOCKS, block_at, find_near, key_of
 from vitamin3d.dense.fused_views import FusedViews
 from vitamin3d.dense.marching_cubes import EMPTY, SIDE, VOXELS, Blocks, zero_level
-from vitamin3d.dense.surface_steps import fill_steps
+from vitamin3d.dense.surface_steps import KNOWN, fill_steps
 from vitamin3d.types import Array, Surface
 
 VIEWS_PER_CORNER = 6
@@ -25,7 +25,7 @@ def surface_of(volume: Any, voxel_length: float, truncation: float, views: Fused
     cloud = volume.extract_voxel_point_cloud()
     blocks = _blocks(np.asarray(cloud.points), np.asarray(cloud.colors), voxel_length)
     fill_steps(blocks, voxel_length, truncation, views)
-    vertices, triangles, _ = zero_level(blocks, 1.0, voxel_length)
+    vertices, triangles, _ = zero_level(blocks, KNOWN, voxel_length)
     vertices += 0.5 * voxel_length
     seen = views.seen(np.ascontiguousarray(vertices.T, np.float32), truncation, VIEWS_PER_CORNER)
     return Surface(vertices, triangles, np.zeros_like(vertices), spread(seen.colors, seen.is_seen, triangles))
@@ -72,7 +72,7 @@ def _fill(points, values, voxel, table, keys, distance, weight):  # type: ignore
         if b == EMPTY:
             return -1
         i = x % SIDE + SIDE * (y % SIDE) + SIDE * SIDE * (z % SIDE)
-        distance[b, i], weight[b, i] = 2.0 * values[n, 0] - 1.0, 1.0
+        distance[b, i], weight[b, i] = 2.0 * values[n, 0] - 1.0, KNOWN
     return count
 
 

@@ -7,6 +7,7 @@ from vitamin3d._jit import kernel
 from vitamin3d.config import RecoveryConfig
 from vitamin3d.geometry.camera import Camera
 from vitamin3d.geometry.rolling_shutter import measured_pixels
+from vitamin3d.geometry.se3 import inverse
 from vitamin3d.mapping.sparse_map import PATCH_PX, SparseMap
 from vitamin3d.tracking.extrema import subpixel_offset
 from vitamin3d.tracking.extrema_tracking import climb
@@ -108,8 +109,7 @@ def _visible_candidates(sparse_map: SparseMap, live_ids: Array, T_cam_world: Arr
     view = camera.fx, camera.fy, canvas.cx, canvas.cy, canvas.width, canvas.height
     is_live, ids = np.zeros(size, np.bool_), np.empty(size, np.int64)
     is_live[live_ids[live_ids < size]] = True
-    poses = np.concatenate([sparse_map.T_cam_world, T_cam_world[None]])
-    centres = -np.einsum("kji,kj->ki", poses[:, :3, :3], poses[:, :3, 3])
+    centres = np.ascontiguousarray(inverse(np.concatenate([sparse_map.T_cam_world, T_cam_world[None]]))[:, :3, 3])
     count = _list_candidates(
         sparse_map.points_world, sparse_map.num_observations, sparse_map.last_observation, is_live, np.array(sparse_map.keyframe_starts),
         centres, np.ascontiguousarray(T_cam_world), view,
