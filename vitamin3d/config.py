@@ -95,12 +95,38 @@ class ExtremaTrackingConfig:
     prediction_sigma_px: float = 3.0
     """sigma of w in Eq. 5."""
     max_steps: int = 10
+    flow_octave: int = 1
+    """The finest octave of the dense flow: 0 the picture's own pixels, 1 half of them in each direction, ..."""
     gate_px: float = 1.05
     """A climb that ends farther from the prediction is a miss: where the flow is exact, a far extremum is another one."""
+    gate_medians: float = 1.25
+    """The gate is as wide as this many medians of the distances, where that is more: the flow is not equally exact in all pictures."""
+    max_gate_px: float = 2.5
     min_roundness: float = 0.2
     """As of the extrema; a climb that ends on a maximum less round is a miss."""
     coast_frames: int = 4
     """Frames in a row that a track may live on its prediction."""
+
+
+@dataclass(frozen=True)
+class ContinuityConfig:
+    """Which picture goes on from which: the one before, moved by the flow, must look like it on a coarse grid. Not in the paper."""
+
+    enabled: bool = True
+    """With `extrema_tracking.prediction = "dense_flow"` only."""
+    reduction: int = 4
+    """Of the grid, beyond the flow's own."""
+    min_contrast: float = 1.5
+    """Grey levels on the grid; a picture with less shows nothing (a covered lens)."""
+    good_correlation: float = 0.9
+    """Below it the flow is tried once more, beginning with a homography of matched corners: large steps, dropped pictures."""
+    min_correlation: float = 0.6
+    """Below it the picture goes on from another one, or from none: a cut, a stray picture."""
+    max_gap: int = 90
+    """Frames after which the last picture before such a break is given up."""
+    corners: int = 1000
+    min_matches: int = 25
+    """That agree on the homography."""
 
 
 @dataclass(frozen=True)
@@ -140,9 +166,11 @@ class LocalizationConfig:
     min_inlier_ratio: float = 0.25
     min_kept_ratio: float = 0.1
     """Inliers over all tracks of landmarks, those that coast included; below it the picture has jumped."""
-    min_median_zncc: float = 0.4
-    """Of the landmarks' patches. Extrema are everywhere: after a jump of the picture tracks climb to others nearby and
-    agree on a camera that stands still; only the looks of the place tell."""
+    votes: int = 8
+    """Landmarks with so many observations in keyframes localise the camera; the others must agree with them. Extrema that slide
+    along an edge look like parallax, and are soon many."""
+    min_voters: int = 60
+    """With fewer of them landmarks with half the observations vote too, then with a quarter, then all."""
 
 
 @dataclass(frozen=True)
@@ -197,6 +225,15 @@ class RelocalizationConfig:
     ransac_iterations: int = 500
     gate_px: float = 6.0
     """Of the first search for the landmarks around their projections."""
+
+
+@dataclass(frozen=True)
+class AtlasConfig:
+    """When a map is kept."""
+
+    min_keyframes: int = 5
+    """A map that is lost with fewer, or with fewer frames localised, is dropped and made anew."""
+    min_frames: int = 15
 
 
 @dataclass(frozen=True)
@@ -548,12 +585,14 @@ class Config:
     extrema: ExtremaConfig = field(default_factory=ExtremaConfig)
     dominant_flow: DominantFlowConfig = field(default_factory=DominantFlowConfig)
     extrema_tracking: ExtremaTrackingConfig = field(default_factory=ExtremaTrackingConfig)
+    continuity: ContinuityConfig = field(default_factory=ContinuityConfig)
     initialization: InitializationConfig = field(default_factory=InitializationConfig)
     localization: LocalizationConfig = field(default_factory=LocalizationConfig)
     keyframes: KeyframeConfig = field(default_factory=KeyframeConfig)
     triangulation: TriangulationConfig = field(default_factory=TriangulationConfig)
     recovery: RecoveryConfig = field(default_factory=RecoveryConfig)
     relocalization: RelocalizationConfig = field(default_factory=RelocalizationConfig)
+    atlas: AtlasConfig = field(default_factory=AtlasConfig)
     window: WindowConfig = field(default_factory=WindowConfig)
     bundle_adjustment: BundleAdjustmentConfig = field(default_factory=BundleAdjustmentConfig)
     final_adjustment: FinalAdjustmentConfig = field(default_factory=FinalAdjustmentConfig)
@@ -579,8 +618,9 @@ def paper_config() -> Config:
         mode="paper",
         curvature=CurvatureConfig(smoothing_sigma_px=2.5),
         extrema=ExtremaConfig(min_roundness=0.0),
-        extrema_tracking=ExtremaTrackingConfig(prediction="dominant_flow", gate_px=8.0, min_roundness=0.0, coast_frames=0),
-        localization=LocalizationConfig(prior_inlier_ratio=2.0, outlier_medians=100.0),
+        extrema_tracking=ExtremaTrackingConfig(prediction="dominant_flow", gate_px=8.0, gate_medians=0.0, min_roundness=0.0, coast_frames=0),
+        continuity=ContinuityConfig(enabled=False),
+        localization=LocalizationConfig(prior_inlier_ratio=2.0, outlier_medians=100.0, votes=0),
         recovery=RecoveryConfig(enabled=False),
         relocalization=RelocalizationConfig(enabled=False),
         window=WindowConfig(keyframes=20, anchors=0),

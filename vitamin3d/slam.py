@@ -18,12 +18,12 @@ from vitamin3d.geometry.se3 import inverse
 from vitamin3d.mapping.calibration_refinement import CalibrationRefinement
 from vitamin3d.mapping.initialization_history import InitializationHistory, TrackedView
 from vitamin3d.mapping.keyframe_selection import is_keyframe
-from vitamin3d.mapping.landmark_recovery import cut_patches, patch_similarity, recover_landmarks, same_landmarks
+from vitamin3d.mapping.landmark_recovery import recover_landmarks, same_landmarks
 from vitamin3d.mapping.landmark_statistics import UnitInformation, keyframe_vertices
 from vitamin3d.mapping.landmark_triangulation import triangulate_landmarks
 from vitamin3d.mapping.map_condensation import condense, is_due
 from vitamin3d.mapping.map_initialization import add_view, build_first_map
-from vitamin3d.mapping.p3p_localization import localize
+from vitamin3d.mapping.p3p_localization import localize, localize_by, voters
 from vitamin3d.mapping.pose_log import PoseLog
 from vitamin3d.mapping.readout_estimation import set_image_motion
 from vitamin3d.mapping.relocalization import relocalize
@@ -35,10 +35,8 @@ from vitamin3d.mapping.window_prior import WindowPrior
 from vitamin3d.mapping.window_selection import Window, build_problem, select_frame_window, select_window, store_solution, whole_map
 from vitamin3d.tracking.extrema import refine_extrema, select_free_extrema
 from vitamin3d.tracking.extrema_tracking import predict_by_dense_flow, predict_by_dominant_flow, track_extrema
-from vitamin3d.types import Array, Frame, FrontEndFrame, MapSnapshot, SlamState, StepTimes, Tracks, Trajectory
+from vitamin3d.types import Array, Frame, FrontEndFrame, Localization, MapSnapshot, SlamState, StepTimes, Tracks, Trajectory
 
-PATCH_STRIDE = 8
-"""Of the tracks whose looks are checked in each frame."""
 UNTAKEN_WINDOWS = 2
 """Pictures of keyframes that nobody takes are kept for so many windows."""
 
@@ -66,6 +64,7 @@ class Slam:
             (self.tracks, self._image_motion, camera),
             (self.tracks, np.zeros((0, 2))),
         )
+        self._before_break: tuple[int, Tracks, int] = -1, self.tracks, 0
         self._next_id = 0
         self._unique_ids, self._num_condensed, self._num_forgotten = np.zeros(0, np.int64), 0, 0
         self._frame_count = 0
@@ -95,7 +94,9 @@ class Slam:
     # --- tracking (Sec. 2) -------------------------------------------------------------------------------------
 
     def _track(self, front: FrontEndFrame) -> Tracks:
-        """Predict (Eq. 4) and climb (Eq. 5)."""
+        """Predict (Eq. 4) and climb (Eq. 5), from the frame that this one continues."""
+        if front.follows != self._newest_frame and not self._resume(front.follows):
+            return Tracks.empty()
         if front.dense_flow is not None:
             predicted = predict_by_dense_flow(self.tracks.pixels, front.dense_flow, self.config.extrema_tracking.flow_reduction)
         else:
@@ -105,6 +106,16 @@ class Slam:
         else:
             self._image_motion = NO_MOTION
         return track_extrema(self.tracks, predicted, front.kappa, self.config.extrema_tracking)
+
+    def _resume(self, followed: int | None) -> bool:
+        """Takes the tracks up again from before a break, if that is the frame followed; keeps those there are where none is."""
+        index, tracks, last_ns = self._before_break
+        if followed is not None and followed == index:
+            self.tracks, self._last_ns = tracks, last_ns
+            return True
+        if followed is None and len(self.tracks):
+            self._before_break = self._newest_frame, self.tracks, self._last_ns
+        return False
 
     def _follow_image_motion(self, timestamp_ns: int, predicted: Array) -> None:
         """How fast the image moves, for the rolling shutter; a keyframe just taken gets the mean of before and after."""
@@ -181,12 +192,8 @@ class Slam:
         seen, pixels = self._seen()
         mapped = self.map.is_mapped(seen.ids)
         ids, seed = seen.ids[mapped], self.config.seed + front.frame.index
-        prior = self.poses.predict(self.map)
-        found = localize(self.map.points_world[ids], pixels[mapped], prior, self.camera, self.config.localization, seed)
-        if not found.converged:
-            return self._find_camera(front)
-        if self._has_jumped(front.frame, seen.select(mapped).select(found.is_inlier)):
-            self.tracks = Tracks.empty()
+        found = self._pose_of_votes(ids, pixels[mapped], self.poses.predict(self.map), seed)
+        if not found.converged or found.is_inlier.sum() < self.config.localization.min_kept_ratio * self.map.is_mapped(self.tracks.ids).sum():
             return self._find_camera(front)
         self.state = SlamState.TRACKING
         self._end_tracks(ids[~found.is_inlier])
@@ -195,14 +202,11 @@ class Slam:
             return self._relocalize(found.T_cam_world)
         return found.T_cam_world
 
-    def _has_jumped(self, frame: Frame, inliers: Tracks) -> bool:
-        """Whether few tracks of landmarks are left, or the places where they ended look unlike their last keyframes."""
-        localization = self.config.localization
-        if len(inliers) < localization.min_kept_ratio * self.map.is_mapped(self.tracks.ids).sum():
-            return True
-        sample = inliers.select(slice(None, None, PATCH_STRIDE))
-        similarity = patch_similarity(self.map.patches[sample.ids], cut_patches(frame.image, sample.pixels))
-        return bool(np.median(similarity) < localization.min_median_zncc)
+    def _pose_of_votes(self, ids: Array, pixels: Array, T_prior: Array, seed: int = 0) -> Localization:
+        """The pose by landmarks (N,) ids at ideal pixels (N, 2), those with many observations deciding."""
+        is_voter = voters(self.map.num_observations[ids], self.config.localization)
+        points = self.map.points_world[ids]
+        return localize_by(is_voter, points, pixels, T_prior, self.camera, self.config.localization, seed)
 
     def _find_camera(self, front: FrontEndFrame) -> Array | None:
         """T_cam_world of a frame whose tracks broke: descriptors, then a search for the landmarks themselves; or LOST."""
@@ -243,7 +247,7 @@ class Slam:
         seen, pixels = self._seen()
         mapped = self.map.is_mapped(seen.ids)
         ids = seen.ids[mapped]
-        found = localize(self.map.points_world[ids], pixels[mapped], T_cam_world, self.camera, self.config.localization)
+        found = self._pose_of_votes(ids, pixels[mapped], T_cam_world)
         if not found.converged:
             return T_cam_world
         self._end_tracks(ids[~found.is_inlier])

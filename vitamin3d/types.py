@@ -61,7 +61,10 @@ class FrontEndFrame:
     """(E, 2) int32, (u, v) of all local maxima of kappa above the noise floor, strongest first."""
     dominant_flow: DominantFlow
     dense_flow: Array | None
-    """(h, w, 2) float32 from the previous to this frame, of and in pixels of the reduced picture; None where it is not used."""
+    """(h, w, 2) float32 from the followed to this frame, of and in pixels of the reduced picture; None where there is none."""
+    follows: int | None = None
+    """Index of the frame whose tracks go on in this one: the previous, an earlier one where pictures between were of something
+    else, None where the picture continues none of them."""
 
 
 @dataclass(frozen=True)

@@ -146,8 +146,39 @@ def localize(
     if start is None:
         return failed
     T = refine_pose(start, points_world, pixels, camera, config.sigma_px, config.iterations)
+    return _judged(T, points_world, pixels, camera, config)
+
+
+def _judged(T: Array, points_world: Array, pixels: Array, camera: Camera, config: LocalizationConfig) -> Localization:
+    """A refined pose with its inliers, converged where they are enough."""
+    n = len(points_world)
     errors = reprojection_errors(T, points_world, pixels, camera.intrinsics)
     is_inlier = errors < _outlier_limit(errors, config)
     enough = is_inlier.sum() >= max(config.min_inliers, config.min_inlier_ratio * n)
     rmse = float(np.sqrt((errors[is_inlier] ** 2).mean())) if is_inlier.any() else float("nan")
     return Localization(T, is_inlier, rmse, bool(enough and np.isfinite(T).all()))
+
+
+def voters(num_observations: Array, config: LocalizationConfig) -> Array:
+    """(N,) bool: which landmarks, by their observations in keyframes (N,), localise the camera; where few have many, those with fewer too."""
+    votes = config.votes
+    while votes > 2 and (num_observations >= votes).sum() < config.min_voters:
+        votes //= 2
+    return np.asarray(num_observations >= votes)
+
+
+def localize_by(
+    is_voter: Array, points_world: Array, pixels: Array, T_prior: Array | None, camera: Camera, config: LocalizationConfig, seed: int = 0
+) -> Localization:
+    """As `localize`, the pose being that of the voters (N,) bool alone; the other landmarks are judged by it."""
+    if is_voter.all():
+        return localize(points_world, pixels, T_prior, camera, config, seed)
+    found = localize(points_world[is_voter], pixels[is_voter], T_prior, camera, config, seed)
+    if not found.converged:
+        return Localization(found.T_cam_world, np.zeros(len(is_voter), np.bool_), found.rmse_px, False)
+    is_inlier = np.zeros(len(is_voter), np.bool_)
+    is_inlier[is_voter] = found.is_inlier
+    errors = reprojection_errors(found.T_cam_world, points_world[~is_voter], pixels[~is_voter], camera.intrinsics)
+    limit = min(config.outlier_px, max(config.min_outlier_px, config.outlier_medians * found.rmse_px))
+    is_inlier[~is_voter] = errors < limit
+    return Localization(found.T_cam_world, is_inlier, found.rmse_px, True)

@@ -31,12 +31,12 @@ def climb(kappa, u, v, predicted_u, predicted_v, weight, squared_sigma, max_step
 
 
 @kernel
-def _climb_all(kappa, predicted, weight, sigma, max_steps, gate, min_roundness, out, out_kappa, found):  # type: ignore[no-untyped-def]
-    """Climbs from each prediction (N, 2); `found` where a positive maximum, round enough, lies within `gate` of it."""
+def _climb_all(kappa, predicted, weight, sigma, max_steps, gate, min_roundness, out, out_kappa, distance):  # type: ignore[no-untyped-def]
+    """Climbs from each prediction (N, 2); the distance to a positive maximum, round enough, within `gate` of it, else infinity."""
     height, width = kappa.shape
     for i in range(predicted.shape[0]):
         pu, pv = predicted[i, 0], predicted[i, 1]
-        out[i, 0], out[i, 1], out_kappa[i], found[i] = pu, pv, 0.0, False
+        out[i, 0], out[i, 1], out_kappa[i], distance[i] = pu, pv, 0.0, np.inf
         u, v = int(round(pu)), int(round(pv))
         if not (u >= 1 and v >= 1 and u < width - 1 and v < height - 1):
             continue
@@ -45,8 +45,9 @@ def _climb_all(kappa, predicted, weight, sigma, max_steps, gate, min_roundness, 
             continue
         x = u + subpixel_offset(kappa[v, u - 1], kappa[v, u], kappa[v, u + 1])
         y = v + subpixel_offset(kappa[v - 1, u], kappa[v, u], kappa[v + 1, u])
-        if (x - pu) ** 2 + (y - pv) ** 2 <= gate * gate:
-            out[i, 0], out[i, 1], out_kappa[i], found[i] = x, y, kappa[v, u], True
+        squared = (x - pu) ** 2 + (y - pv) ** 2
+        if squared <= gate * gate:
+            out[i, 0], out[i, 1], out_kappa[i], distance[i] = x, y, kappa[v, u], np.sqrt(squared)
 
 
 @kernel
@@ -96,6 +97,14 @@ def predict_by_dense_flow(pixels: Array, flow: Array, reduction: int = 1) -> Arr
     return out
 
 
+def _gate(distances: Array, config: ExtremaTrackingConfig) -> float:
+    """Pixels: a multiple of the median distance of those reached, within the settings' bounds."""
+    reached = distances[np.isfinite(distances)]
+    if config.gate_medians == 0.0 or len(reached) == 0:
+        return config.gate_px
+    return max(config.gate_px, min(config.max_gate_px, config.gate_medians * float(np.median(reached))))
+
+
 def track_extrema(tracks: Tracks, predicted: Array, kappa: Array, config: ExtremaTrackingConfig) -> Tracks:
     """The tracks in the current image: those found, and those that coast on their prediction.
 
@@ -108,9 +117,12 @@ def track_extrema(tracks: Tracks, predicted: Array, kappa: Array, config: Extrem
         Tracks, `missed` > 0 where no extremum was found; tracks that meet on one pixel are merged into the oldest.
     """
     n = len(tracks)
-    pixels, values, found = np.empty((n, 2)), np.empty(n, np.float32), np.empty(n, np.bool_)
+    pixels, values, distances = np.empty((n, 2)), np.empty(n, np.float32), np.empty(n)
     weight, sigma, climbable = config.prediction_weight, config.prediction_sigma_px, np.ascontiguousarray(predicted)
-    _climb_all(kappa, climbable, weight, sigma, config.max_steps, config.gate_px, config.min_roundness, pixels, values, found)
+    widest = max(config.gate_px, config.max_gate_px if config.gate_medians else 0.0)
+    _climb_all(kappa, climbable, weight, sigma, config.max_steps, widest, config.min_roundness, pixels, values, distances)
+    found = distances <= _gate(distances[tracks.missed == 0], config)
+    pixels = np.where(found[:, None], pixels, predicted)
     missed = np.where(found, np.int32(0), tracks.missed + np.int32(1))
     moved = Tracks(tracks.ids, pixels, np.where(found, values, tracks.kappa), tracks.ages + np.int32(1), missed)
     u, v, (height, width) = pixels[:, 0], pixels[:, 1], kappa.shape

@@ -1,0 +1,135 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Which earlier picture a picture continues, and the flow from it: a cut, a stray picture or a covered lens must not pull the tracks along.
+
+Extrema are everywhere: after a jump of the picture tracks climb to others nearby and agree on a camera that stands still. But the
+picture before, moved by the flow, then looks unlike this one on a coarse grid, where neither blur nor noise nor exposure matter.
+"""
+
+from dataclasses import dataclass
+
+import cv2
+import numpy as np
+
+from vitamin3d.config import ContinuityConfig
+from vitamin3d.types import Array
+
+FAST_THRESHOLD = 7
+HOMOGRAPHY_PX, HOMOGRAPHY_ITERATIONS = 6.0, 500
+
+
+@dataclass(frozen=True)
+class View:
+    """A picture as the next ones are compared with it."""
+
+    index: int
+    picture: Array
+    """(h, w) uint8, reduced."""
+    grid: Array
+    """(h / reduction, w / reduction) float32."""
+
+    @property
+    def contrast(self) -> float:
+        """Standard deviation on the grid, grey levels."""
+        return float(self.grid.std())
+
+
+@dataclass(frozen=True)
+class Continuation:
+    """A flow and how well it explains the picture."""
+
+    flow: Array
+    """(h, w, 2) float32, pixels of the reduced picture."""
+    correlation: float
+    """Of the two grids where the flow stays in the picture, in [-1, 1]."""
+
+
+def view_of(index: int, picture: Array, config: ContinuityConfig) -> View:
+    """A reduced picture (h, w) uint8 with its coarse grid."""
+    size = max(1, picture.shape[1] // config.reduction), max(1, picture.shape[0] // config.reduction)
+    return View(index, picture, cv2.resize(picture, size, interpolation=cv2.INTER_AREA).astype(np.float32))
+
+
+def correlation(a: Array, b: Array, flow: Array) -> float:
+    """Zero-mean normalised cross-correlation of grid a (h, w) with grid b moved back by a flow (H, W, 2) in pixels of its own; 0 for none."""
+    height, width = a.shape
+    coarse = cv2.resize(flow, (width, height), interpolation=cv2.INTER_AREA) * np.float32(width / flow.shape[1])
+    u, v = np.meshgrid(np.arange(width, dtype=np.float32), np.arange(height, dtype=np.float32))
+    u, v = u + coarse[..., 0], v + coarse[..., 1]
+    moved = cv2.remap(b, u, v, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
+    inside = (u >= 0) & (v >= 0) & (u <= width - 1) & (v <= height - 1)
+    if inside.sum() < 0.1 * a.size:
+        return 0.0
+    x, y = a[inside] - a[inside].mean(), moved[inside] - moved[inside].mean()
+    return float((x * y).sum() / np.sqrt(max(1e-6, float((x * x).sum()) * float((y * y).sum()))))
+
+
+def homography_flow(a: Array, b: Array, config: ContinuityConfig) -> Array | None:
+    """Flow (h, w, 2) float32 by the homography of matched corners of two pictures (h, w) uint8; None where few agree on one."""
+    orb = cv2.ORB_create(config.corners, fastThreshold=FAST_THRESHOLD)  # type: ignore[attr-defined]
+    (points_a, words_a), (points_b, words_b) = (orb.detectAndCompute(picture, None) for picture in (a, b))
+    if words_a is None or words_b is None:
+        return None
+    matches = cv2.BFMatcher(cv2.NORM_HAMMING, crossCheck=True).match(words_a, words_b)
+    if len(matches) < config.min_matches:
+        return None
+    x, y = np.array([points_a[m.queryIdx].pt for m in matches]), np.array([points_b[m.trainIdx].pt for m in matches])
+    H, agrees = cv2.findHomography(x, y, cv2.RANSAC, HOMOGRAPHY_PX, maxIters=HOMOGRAPHY_ITERATIONS)
+    if H is None or agrees.sum() < config.min_matches:
+        return None
+    u, v = np.meshgrid(np.arange(a.shape[1], dtype=np.float64), np.arange(a.shape[0], dtype=np.float64))
+    moved = np.stack([u, v, np.ones_like(u)], axis=-1) @ H.T
+    with np.errstate(divide="ignore", invalid="ignore"):
+        flow = moved[..., :2] / moved[..., 2:] - np.stack([u, v], axis=-1)
+    return flow.astype(np.float32) if np.isfinite(flow).all() and np.abs(flow).max() < 2 * a.shape[1] else None
+
+
+class FlowTracker:
+    """The flow to each picture from the one it continues; remembers the previous picture, and the last one before a break."""
+
+    def __init__(self, dis: cv2.DISOpticalFlow, dis_from: cv2.DISOpticalFlow, config: ContinuityConfig) -> None:
+        self._dis, self._dis_from, self.config = dis, dis_from, config
+        self._previous: View | None = None
+        self._before_break: View | None = None
+
+    def follow(self, index: int, picture: Array) -> tuple[Array | None, int | None]:
+        """The flow (h, w, 2) from the picture that a reduced picture (h, w) uint8 continues, and that one's index; None for none."""
+        view = view_of(index, picture, self.config)
+        previous, self._previous = self._previous, view
+        if previous is None:
+            return None, None
+        if not self.config.enabled:
+            return self._flow(previous, view), previous.index
+        return self._continued(previous, view)
+
+    def _continued(self, previous: View, view: View) -> tuple[Array | None, int | None]:
+        earlier = self._before_break
+        for candidate in (previous, earlier):
+            found = None if candidate is None else self._continuation(candidate, view)
+            if candidate is not None and found is not None and found.correlation >= self.config.min_correlation:
+                self._forget_break(candidate, view.index)
+                return found.flow, candidate.index
+        if earlier is None or view.index - earlier.index > self.config.max_gap:
+            self._before_break = previous
+        return None, None
+
+    def _forget_break(self, followed: View, index: int) -> None:
+        """The picture before a break is given up once it is followed, or too old."""
+        earlier = self._before_break
+        if earlier is not None and (followed is earlier or index - earlier.index > self.config.max_gap):
+            self._before_break = None
+
+    def _continuation(self, a: View, b: View) -> Continuation | None:
+        """The better one of the plain flow and the one that begins with a homography; None where one of the pictures shows nothing."""
+        if min(a.contrast, b.contrast) < self.config.min_contrast:
+            return None
+        flow = self._flow(a, b)
+        plain = Continuation(flow, correlation(a.grid, b.grid, flow))
+        start = None if plain.correlation >= self.config.good_correlation else homography_flow(a.picture, b.picture, self.config)
+        if start is None:
+            return plain
+        flow = np.asarray(self._dis_from.calc(a.picture, b.picture, start))
+        again = Continuation(flow, correlation(a.grid, b.grid, flow))
+        return again if again.correlation > plain.correlation else plain
+
+    def _flow(self, a: View, b: View) -> Array:
+        return np.asarray(self._dis.calc(a.picture, b.picture, None))
