@@ -5,29 +5,46 @@ Where the camera is lost, a new map begins beside the search for the old one. Wh
 camera found in it, or the new one once it has held for a while. A map that is lost while it is young is dropped and made anew.
 """
 
+import numpy as np
+
 from vitamin3d.config import Config
 from vitamin3d.geometry.camera import Camera
+from vitamin3d.mapping.window_adjustment import AdjustAtOnce, Adjuster
 from vitamin3d.slam import Slam
-from vitamin3d.types import FrontEndFrame, SlamState
-
+from vitamin3d.types import Frame, FrameNote, FrontEndFrame, SlamState, StepTimes
 
 class Atlas:
     """Never gives up: tracks a sequence through as many maps as it takes."""
 
     def __init__(self, camera: Camera, config: Config) -> None:
         self.camera, self.config = camera, config
-        self.maps: list[Slam] = []
-        """Those that were left, each lost."""
-        self.active = Slam(camera, config)
+        self.times = StepTimes()
+        self.notes: list[FrameNote] = []
+        """One per frame processed."""
+        self.adjuster: Adjuster = AdjustAtOnce()
+        self._born = 0
+        self.left: list[Slam] = []
+        """Maps in which the camera was lost and that another one followed."""
+        self.active = self._new_map()
         """The map in which the camera is tracked, or was last."""
         self.successor: Slam | None = None
         """The next one, while the camera is lost in the active one."""
 
+    @property
+    def current(self) -> Slam:
+        """The map for which the newest frame was tracked."""
+        return self.active if self.successor is None else self.successor
+
     def process_frame(self, front: FrontEndFrame) -> SlamState:
         """One frame: tracked in the active map, or in the one that begins where that is lost."""
+        state = self._tracked(front)
+        self.notes.append(self._note(front, state))
+        return state
+
+    def _tracked(self, front: FrontEndFrame) -> SlamState:
         state = self.active.process_frame(front)
         if state is not SlamState.LOST:
-            self._drop_successor()
+            self.successor = None
             return state
         if self._is_young(self.active) and self.successor is None:
             self.active = self._new_map()
@@ -39,26 +56,59 @@ class Atlas:
         self.successor = self.successor or self._new_map()
         state = self.successor.process_frame(front)
         if state is SlamState.LOST:
-            self.successor = None
-        elif state is SlamState.TRACKING and not self._is_young(self.successor):
-            self.maps.append(self.active)
+            self.successor = self._new_map()
+            return self.successor.process_frame(front)
+        if state is SlamState.TRACKING and not self._is_young(self.successor):
+            self.left.append(self.active)
             self.active, self.successor = self.successor, None
         return state
 
-    def _drop_successor(self) -> None:
-        self.successor = None
-
     def _new_map(self) -> Slam:
-        return Slam(self.camera, self.config)
+        slam = Slam(self.camera, self.config, self._born, self.times)
+        slam.adjuster = self.adjuster
+        self._born += 1
+        return slam
 
     def _is_young(self, slam: Slam) -> bool:
         return slam.map.num_keyframes < self.config.atlas.min_keyframes or len(slam.poses) < self.config.atlas.min_frames
 
+    def _note(self, front: FrontEndFrame, state: SlamState) -> FrameNote:
+        flow, slam, frame = front.dense_flow, self.current, front.frame
+        motion = 0.0 if flow is None else self.config.extrema_tracking.flow_reduction * float(np.median(np.hypot(*flow[::8, ::8].T)))
+        small = frame.image[::4, ::4]
+        num_tracks = int((slam.tracks.missed == 0).sum())
+        return FrameNote(
+            frame.index, frame.timestamp_ns, state, slam.number, len(front.extrema), num_tracks, float(small.std()), float(small.mean()),
+            front.follows is not None, motion, slam.initialization_reason,
+        )  # fmt: skip
+
+    def use_adjuster(self, adjuster: Adjuster) -> None:
+        """Windows of all maps are adjusted by it from now on."""
+        self.adjuster = adjuster
+        for slam in self._all():
+            slam.adjuster = adjuster
+
+    def take_adjustment(self, wait: bool = False) -> None:
+        """The window that was adjusted meanwhile enters the active map."""
+        self.active.take_adjustment(wait)
+
+    @property
+    def adjustments_awaited(self) -> int:
+        return sum(slam.adjustments_awaited for slam in self._all())
+
     def finish(self) -> None:
+        """The adjustment of each whole map at the end of a recording."""
         for slam in self.ranked():
             slam.finish()
 
     def ranked(self) -> list[Slam]:
         """The maps that hold something, the one with most frames first."""
-        found = [slam for slam in (*self.maps, self.active) if slam.map.num_keyframes]
-        return sorted(found, key=lambda slam: -len(slam.poses))
+        found = [slam for slam in self._all() if slam.map.num_keyframes]
+        return sorted(found, key=lambda slam: (-len(slam.poses), slam.number))
+
+    def _all(self) -> list[Slam]:
+        return [*self.left, self.active, *([] if self.successor is None else [self.successor])]
+
+    def take_settled_keyframes(self, everything: bool = False) -> list[tuple[Slam, int, Frame]]:
+        """Map, keyframe and picture of those that settled since the last call (or all that remain), each once."""
+        return [(slam, k, frame) for slam in self._all() for k, frame in slam.take_settled_keyframes(everything)]

@@ -58,7 +58,13 @@ class ExtremaConfig:
     """Sec. 2.1: which maxima of the curvature become tracks."""
 
     min_curvature: float = 0.15
-    """Noise floor of kappa, grey levels³ per pixel⁴ of the smoothed 0–255 image."""
+    """Floor of kappa, grey levels³ per pixel⁴ of the smoothed 0–255 image."""
+    wanted: int = 3000
+    """With fewer maxima above it the floor sinks, 0: never;"""
+    lowest_curvature: float = 0.02
+    """but not below this,"""
+    noise_curvature: float = 0.004
+    """nor below this many times the third power of the deviation of the picture's noise. Curvatures are then scaled to `min_curvature`."""
     min_roundness: float = 0.65
     """4 det / trace² of kappa's Hessian at the maximum: on a ridge (0) it slides, on a round hill (1) it stays; 0: all maxima."""
     max_tracks: int = 9000
@@ -617,7 +623,7 @@ def paper_config() -> Config:
     return Config(
         mode="paper",
         curvature=CurvatureConfig(smoothing_sigma_px=2.5),
-        extrema=ExtremaConfig(min_roundness=0.0),
+        extrema=ExtremaConfig(min_roundness=0.0, wanted=0),
         extrema_tracking=ExtremaTrackingConfig(prediction="dominant_flow", gate_px=8.0, gate_medians=0.0, min_roundness=0.0, coast_frames=0),
         continuity=ContinuityConfig(enabled=False),
         localization=LocalizationConfig(prior_inlier_ratio=2.0, outlier_medians=100.0, votes=0),

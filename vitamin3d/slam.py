@@ -37,6 +37,8 @@ from vitamin3d.tracking.extrema import refine_extrema, select_free_extrema
 from vitamin3d.tracking.extrema_tracking import predict_by_dense_flow, predict_by_dominant_flow, track_extrema
 from vitamin3d.types import Array, Frame, FrontEndFrame, Localization, MapSnapshot, SlamState, StepTimes, Tracks, Trajectory
 
+IDS_PER_MAP = 1 << 40
+"""Tracks of different maps have different ids."""
 UNTAKEN_WINDOWS = 2
 """Pictures of keyframes that nobody takes are kept for so many windows."""
 
@@ -44,13 +46,13 @@ UNTAKEN_WINDOWS = 2
 class Slam:
     """Tracks the extrema of a monocular sequence and maps them (Sec. 2 and 3 of the paper)."""
 
-    def __init__(self, camera: Camera, config: Config) -> None:
-        self.camera, self.config = camera, config
+    def __init__(self, camera: Camera, config: Config, number: int = 0, times: StepTimes | None = None) -> None:
+        self.camera, self.config, self.number = camera, config, number
         self.state = SlamState.INITIALIZING
         self.tracks = Tracks.empty()
         self.map = SparseMap()
         self.poses = PoseLog()
-        self.times = StepTimes()
+        self.times = times or StepTimes()
         self.initialization_reason, self.initialization_retries = "no frame was read", 0
         self.calibration = CalibrationRefinement(camera, config.calibration)
         self.adjuster: Adjuster = AdjustAtOnce()
@@ -337,8 +339,8 @@ class Slam:
             needed = np.concatenate([self.tracks.ids, *(pair.ravel() for pair in self._meetings)])
             done = condense(self.map, np.unique(needed), UNTAKEN_WINDOWS * self.config.window.keyframes, self.config.memory)
             self.poses.move_to(done.kept_keyframes, self.map)
-            self._unique_ids = self.unique_ids(done.kept_ids)
-            self._num_forgotten = self.unique_ids(np.array([self._next_id]))[0] - len(done.kept_ids)
+            born = self.unique_ids(np.append(done.kept_ids, self._next_id)) - self.number * IDS_PER_MAP
+            self._unique_ids, self._num_forgotten = born[:-1], int(born[-1]) - len(done.kept_ids)
             renamed = np.searchsorted(done.kept_ids, self.tracks.ids)
             self.tracks = replace(self.tracks, ids=renamed)
             self._meetings = [np.searchsorted(done.kept_ids, pair) for pair in self._meetings]
@@ -351,7 +353,7 @@ class Slam:
         known = ids < self._num_condensed
         out = ids + self._num_forgotten
         out[known] = self._unique_ids[ids[known]]
-        return np.asarray(out)
+        return np.asarray(out + self.number * IDS_PER_MAP)
 
     def _refine_calibration_when_due(self) -> None:
         if self.calibration.is_due(self.map.num_keyframes):
@@ -418,7 +420,7 @@ class Slam:
         if self.config.snapshot.unobserved:
             vertices = with_unobserved(vertices, *at)
         motion = self.map.image_motions[keyframe]
-        return MapSnapshot(at_one_moment(frame, motion, self.camera), self.map.clone_pose(keyframe), *vertices)
+        return MapSnapshot(at_one_moment(frame, motion, self.camera), self.map.clone_pose(keyframe), *vertices, self.number)
 
     def trajectory(self) -> Trajectory:
         """Camera-to-world poses of all localised frames."""

@@ -170,6 +170,8 @@ class MapSnapshot:
     """(N,) along z, map units."""
     relative_deviations: Array
     """(N,) standard deviation of the depth divided by the depth."""
+    map_number: int = 0
+    """Of the map it belongs to, in the order of their births."""
 
 
 @dataclass(frozen=True)
@@ -263,8 +265,37 @@ class SlamState(Enum):
     """What the tracker is doing after a frame."""
 
     INITIALIZING = "initializing"
+    """There is no map yet."""
+    ROTATING = "rotating"
+    """No map, but the camera turns without travelling: its orientation is followed."""
     TRACKING = "tracking"
+    UNCERTAIN = "uncertain"
+    """Tracked, but what is seen does not determine the pose well: nothing is added to the map."""
     LOST = "lost"
+
+
+@dataclass(frozen=True)
+class FrameNote:
+    """What became of a frame when it was processed, and what it looked like: why it is not localised, where it is not."""
+
+    index: int
+    timestamp_ns: int
+    state: SlamState
+    map_number: int
+    """Of the map that it was tracked for, in the order of their births, from 0."""
+    num_extrema: int
+    num_tracks: int
+    """Seen in it."""
+    contrast: float
+    """Standard deviation of its grey levels."""
+    brightness: float
+    """Their mean."""
+    continues: bool
+    """It continues an earlier picture; else it is of something else, or shows nothing."""
+    motion_px: float
+    """Median motion of the picture since the one it continues; 0 where there is none."""
+    reason: str
+    """Of a frame without a map: why there is none yet."""
 
 
 @dataclass

@@ -1,6 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
 """The part of the front end that needs pixels only, so that a thread can run it ahead of the map."""
 
+from dataclasses import replace
+
 import cv2
 import numpy as np
 
@@ -9,6 +11,7 @@ from vitamin3d.tracking.continuity import FlowTracker
 from vitamin3d.tracking.curvature import curvature
 from vitamin3d.tracking.dominant_flow import CoarseFeatures, coarse_features, estimate_dominant_flow
 from vitamin3d.tracking.extrema import detect_extrema
+from vitamin3d.tracking.noise_floor import curvature_floor, lowest_floor
 from vitamin3d.types import Array, DominantFlow, Frame, FrontEndFrame, StepTimes
 
 DESCENT_ITERATIONS = 8
@@ -37,8 +40,7 @@ class FrontEnd:
     def process(self, frame: Frame) -> FrontEndFrame:
         """Curvature (Eq. 1), its maxima (Sec. 2.1) and the flow since the frame that it continues (Sec. 2.2)."""
         with self.times.timed("curvature_extrema"):
-            kappa = curvature(frame.image, self.config.curvature)
-            extrema = detect_extrema(kappa, self.config.extrema)
+            kappa, extrema = self._extrema(frame.image)
         with self.times.timed("flow"):
             flow, follows = None, self._previous
             if self.config.extrema_tracking.prediction == "dense_flow":
@@ -47,6 +49,18 @@ class FrontEnd:
                 self._update_dominant_flow(frame.image)
         self._previous = frame.index
         return FrontEndFrame(frame, kappa, extrema, self._dominant_flow, flow, follows)
+
+    def _extrema(self, image: Array) -> tuple[Array, Array]:
+        """Curvature in the unit of its floor, and the maxima above that, strongest first."""
+        config, kappa = self.config.extrema, curvature(image, self.config.curvature)
+        if config.wanted == 0:
+            return kappa, detect_extrema(kappa, config)
+        lowest = lowest_floor(image, self.config.curvature.smoothing_sigma_px, config)
+        extrema = detect_extrema(kappa, replace(config, min_curvature=lowest))
+        strengths = kappa[extrema[:, 1], extrema[:, 0]]
+        floor = curvature_floor(strengths, lowest, config)
+        kappa *= np.float32(config.min_curvature / floor)
+        return kappa, extrema[: int((strengths >= floor).sum())]
 
     def _reduced(self, image: Array) -> Array:
         reduction = self.config.extrema_tracking.flow_reduction
