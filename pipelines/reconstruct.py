@@ -9,7 +9,7 @@ The command `vitamin3d reconstruct` does the same with more options; see `vitami
 import sys
 from pathlib import Path
 
-from vitamin3d import Config, FrontEnd, OutputFolder, Reconstruction, Scale, Slam, Unreadable, open_dataset, point_cloud
+from vitamin3d import Atlas, Config, FrontEnd, OutputFolder, Reconstruction, Scale, Unreadable, open_dataset, point_cloud
 
 
 def main(argv: list[str] | None = None) -> int:
@@ -19,30 +19,34 @@ def main(argv: list[str] | None = None) -> int:
     config, scale, output = Config(), Scale(), OutputFolder(Path(out), overwrite=True)
 
     front_end = FrontEnd(config)  # curvature, its extrema, and the flow between two pictures
-    slam = Slam(dataset.camera, config)  # tracks the extrema, localises the camera, maps the landmarks
+    atlas = Atlas(dataset.camera, config)  # tracks the extrema, localises the camera, maps the landmarks; a new map where it is lost
 
     for index in range(len(dataset)):
         frame = dataset.read(index)
         if isinstance(frame, Unreadable):
             print(f"skipped {frame.path}: {frame.reason}", file=sys.stderr)
             continue
-        slam.process_frame(front_end.process(frame))
-    if slam.map.num_keyframes == 0:
-        print(f"no map: {slam.initialization_reason}", file=sys.stderr)
+        atlas.process_frame(front_end.process(frame))
+    atlas.finish()  # adjusts each whole map once more
+    if not atlas.ranked():
+        print(f"no map: {atlas.current.initialization_reason}", file=sys.stderr)
         return 3
-    slam.finish()  # adjusts the whole map once more
-
-    reconstruction = Reconstruction(slam.camera, config, num_keyframes=slam.map.num_keyframes)  # meshes, denoises and fuses the keyframes
-    for keyframe, index in enumerate(slam.map.frame_indices):
-        frame = dataset.read(index)
-        if not isinstance(frame, Unreadable):
-            reconstruction.add_keyframe(slam.snapshot(keyframe, frame))
 
     output.write_config(config)
-    output.write_trajectories(slam.trajectory(), slam.keyframe_trajectory(), scale)
-    output.write_cloud(point_cloud(slam.map, slam.camera, config.cloud, config.snapshot), scale, "")
-    empty = output.write_surfaces(*reconstruction.surfaces(), scale, reconstruction.voxel_lengths(), reconstruction.filter_remark)
-    print(f"{len(slam.trajectory())} of {len(dataset)} frames localised, {slam.map.num_keyframes} keyframes: {output.path}")
+    empty: list[str] = []
+    for number, slam in enumerate(atlas.ranked(), 1):  # the largest map first
+        reconstruction = Reconstruction(slam.camera, config, num_keyframes=slam.map.num_keyframes)  # meshes, denoises and fuses keyframes
+        for keyframe, index in enumerate(slam.map.frame_indices):
+            frame = dataset.read(index)
+            if not isinstance(frame, Unreadable):
+                reconstruction.add_keyframe(slam.snapshot(keyframe, frame))
+
+        folder = output.map_folder(number)
+        folder.write_trajectories(slam.trajectory(), slam.keyframe_trajectory(), scale)
+        folder.write_cloud(point_cloud(slam.map, slam.camera, config.cloud, config.snapshot), scale, "")
+        missing = folder.write_surfaces(*reconstruction.surfaces(), scale, reconstruction.voxel_lengths(), reconstruction.filter_remark)
+        empty += missing if number == 1 else []
+        print(f"{len(slam.trajectory())} of {len(dataset)} frames localised, {slam.map.num_keyframes} keyframes: {folder.path}")
     if empty:
         print(f"no surface: {', '.join(empty)}", file=sys.stderr)
     return 1 if "mesh_high" in empty else 0

@@ -28,6 +28,8 @@ FORBIDDEN = {
 """Unit -> what it must not import from `vitamin3d.`; the empty name: nothing of ours at all."""
 ABOVE = (
     "slam",
+    "atlas",
+    "map_output",
     "reconstruction",
     "warmup",
     "workers",

@@ -19,15 +19,16 @@ from typing import Any
 
 import numpy as np
 
+from vitamin3d.atlas import Atlas
 from vitamin3d.config import Config, paper_config
 from vitamin3d.datasets import Dataset, open_dataset
 from vitamin3d.errors import InputError, Vitamin3dError
 from vitamin3d.evaluation.track_statistics import TrackStatistics, poses_at, track_statistics
 from vitamin3d.evaluation.trajectory_error import Alignment, absolute_errors, matched, success_rate, summarize
 from vitamin3d.exporters.files import write_file
+from vitamin3d.run_statistics import largest_map, num_localised
 from vitamin3d.runtime import RunRecord, median_of, run_sequential
 from vitamin3d.scale import MATCH_TOLERANCE_NS
-from vitamin3d.slam import Slam
 from vitamin3d.tracking.front_end import FrontEnd
 from vitamin3d.types import Trajectory
 
@@ -110,14 +111,14 @@ def with_setting(config: Config, setting: str, value: Any) -> Config:
 
 def run(trial: Trial, config: Config) -> Score:
     """Tracks and maps the sequence once."""
-    front_end, slam = FrontEnd(config), Slam(trial.dataset.camera, config)
+    front_end, atlas = FrontEnd(config), Atlas(trial.dataset.camera, config)
     start = time.process_time()
-    record = run_sequential(trial.dataset, trial.indices, front_end, slam, record=RunRecord(tracks=[] if trial.score_tracks else None))
-    slam.finish()
-    seconds = time.process_time() - start
+    record = run_sequential(trial.dataset, trial.indices, front_end, atlas, record=RunRecord(tracks=[] if trial.score_tracks else None))
+    atlas.finish()
+    seconds, slam = time.process_time() - start, largest_map(atlas)
     return Score(
         ate_cm=100 * ate(slam.trajectory(), trial.truth),
-        localised=success_rate(len(slam.poses), len(trial.indices)),
+        localised=success_rate(num_localised(atlas), len(trial.indices)),
         live_tracks=median_of(record.live_tracks),
         keyframes=slam.map.num_keyframes,
         landmarks=int(np.isfinite(slam.map.points_world[:, 0]).sum()),

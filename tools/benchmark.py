@@ -40,7 +40,7 @@ from vitamin3d.datasets import Dataset, Unreadable, open_dataset
 from vitamin3d.errors import InputError, Vitamin3dError
 from vitamin3d.exporters.files import write_file
 from vitamin3d.exporters.line_plot import Axes, Line, line_plot
-from vitamin3d.job import with_voxels
+from vitamin3d.map_output import with_voxels
 from vitamin3d.mapping.landmark_statistics import information_by_id
 from vitamin3d.mapping.window_adjustment import WindowAdjustment
 from vitamin3d.mapping.window_selection import Window

@@ -39,7 +39,6 @@ from vitamin3d.geometry.camera import Camera
 from vitamin3d.geometry.se3 import exp_se3, inverse, log_so3, transform_points
 from vitamin3d.geometry.sim3_alignment import align_sim3
 from vitamin3d.mapping.window_selection import build_problem, select_window, whole_map
-from vitamin3d.runtime import run_sequential
 from vitamin3d.slam import Slam
 from vitamin3d.tracking.front_end import FrontEnd
 from vitamin3d.types import Array
@@ -158,7 +157,11 @@ def record(source: str, folder: Path, keyframes: int, anchors: int, every: int, 
     folder.mkdir(parents=True, exist_ok=True)
     slam = RecordingSlam(dataset.camera, config)
     slam.folder, slam.every, slam.truth = folder, every, SequenceTruth(dataset, Path(source))
-    run_sequential(dataset, range(min(frames, len(dataset))), FrontEnd(config), slam)
+    front_end = FrontEnd(config)
+    for index in range(min(frames, len(dataset))):
+        frame = dataset.read(index)
+        if not isinstance(frame, Unreadable):
+            slam.process_frame(front_end.process(frame))
     save_problem(folder / "map.npz", build_problem(slam.map, whole_map(slam.map)), slam.camera)
 
 

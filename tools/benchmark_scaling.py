@@ -21,6 +21,7 @@ import cv2
 import numpy as np
 from benchmark_tracking import DEMO, klt_milliseconds
 
+from vitamin3d.atlas import Atlas
 from vitamin3d.bundle_adjustment.adjust import adjust_bundle
 from vitamin3d.config import Config
 from vitamin3d.datasets import Dataset, Unreadable, open_dataset
@@ -30,6 +31,7 @@ from vitamin3d.exporters.files import write_file
 from vitamin3d.exporters.line_plot import Axes, Line, line_plot
 from vitamin3d.mapping.window_selection import build_problem, select_window
 from vitamin3d.reconstruction import Reconstruction
+from vitamin3d.run_statistics import largest_map
 from vitamin3d.runtime import run_sequential
 from vitamin3d.scale import Scale, scale_from_ground_truth
 from vitamin3d.slam import Slam
@@ -126,8 +128,9 @@ def measured(dataset: Dataset, frames: int) -> dict[str, Curves]:
     pictures = [f for i in range(min(20, len(dataset))) if not isinstance(f := dataset.read(i), Unreadable)]
     if len(pictures) < 2:
         raise InputError(f"{dataset.name}: no two of the first pictures can be read")
-    slam = Slam(dataset.camera, config)
-    run_sequential(dataset, range(min(frames, len(dataset))), FrontEnd(config), slam)
+    atlas = Atlas(dataset.camera, config)
+    run_sequential(dataset, range(min(frames, len(dataset))), FrontEnd(config), atlas)
+    slam = largest_map(atlas)
     if slam.map.num_keyframes < 2 * max(KEYFRAMES[:2]):
         raise InputError(f"{dataset.name}: a map of {slam.map.num_keyframes} keyframes is too small; give more frames")
     truth = dataset.ground_truth()

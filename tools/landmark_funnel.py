@@ -15,12 +15,11 @@ import cv2
 import numpy as np
 
 from vitamin3d.config import Config, load_toml
-from vitamin3d.datasets import open_dataset
+from vitamin3d.datasets import Unreadable, open_dataset
 from vitamin3d.errors import InputError, Vitamin3dError
 from vitamin3d.exporters.files import write_file
 from vitamin3d.mapping.landmark_statistics import keyframe_vertices, landmark_information, landmark_statistics, relative_depth_deviations
 from vitamin3d.mapping.visible_landmarks import with_unobserved
-from vitamin3d.runtime import run_sequential
 from vitamin3d.slam import Slam
 from vitamin3d.tracking.extrema_tracking import predict_by_dense_flow
 from vitamin3d.tracking.front_end import FrontEnd
@@ -158,8 +157,11 @@ def visible_per_keyframe(slam: FunnelSlam) -> float:
 def measure(source: Path, frames: int | None, config: Config) -> FunnelSlam:
     """The sequence tracked and mapped, with its account."""
     dataset = open_dataset(source)
-    slam = FunnelSlam(dataset.camera, config)
-    run_sequential(dataset, range(min(len(dataset), frames or len(dataset))), FrontEnd(config), slam)
+    front_end, slam = FrontEnd(config), FunnelSlam(dataset.camera, config)
+    for index in range(min(len(dataset), frames or len(dataset))):
+        frame = dataset.read(index)
+        if not isinstance(frame, Unreadable):
+            slam.process_frame(front_end.process(frame))
     slam.finish()
     return slam
 

@@ -8,6 +8,7 @@ from importlib import import_module
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
+    from vitamin3d.atlas import Atlas
     from vitamin3d.bundle_adjustment.adjust import AdjustmentSettings, adjust
     from vitamin3d.bundle_adjustment.marginalization import marginalize
     from vitamin3d.bundle_adjustment.problem import make_problem
@@ -29,6 +30,7 @@ if TYPE_CHECKING:
     from vitamin3d.types import Frame, SlamState, Surface, Trajectory
 
 _HOMES = {
+    "atlas": ("Atlas",),
     "bundle_adjustment.adjust": ("AdjustmentSettings", "adjust"),
     "bundle_adjustment.marginalization": ("marginalize",),
     "bundle_adjustment.problem": ("make_problem",),
@@ -53,6 +55,7 @@ _MODULES = {name: module for module, names in _HOMES.items() for name in names}
 
 __all__ = [
     "AdjustmentSettings",
+    "Atlas",
     "Camera",
     "Config",
     "Frame",

@@ -43,9 +43,10 @@ class Atlas:
 
     def _tracked(self, front: FrontEndFrame) -> SlamState:
         state = self.active.process_frame(front)
-        if state is not SlamState.LOST:
+        if state not in (SlamState.LOST, SlamState.ROTATING):
             self.successor = None
             return state
+        self.active.take_adjustment(wait=True)  # both maps may have one adjuster, and it does one thing at a time
         if self._is_young(self.active) and self.successor is None:
             self.active = self._new_map()
             return self.active.process_frame(front)
@@ -55,6 +56,7 @@ class Atlas:
         """The frame in the successor, which becomes the active map when it has held for a while."""
         self.successor = self.successor or self._new_map()
         state = self.successor.process_frame(front)
+        self.successor.take_adjustment(wait=True)
         if state is SlamState.LOST:
             self.successor = self._new_map()
             return self.successor.process_frame(front)
@@ -111,4 +113,8 @@ class Atlas:
 
     def take_settled_keyframes(self, everything: bool = False) -> list[tuple[Slam, int, Frame]]:
         """Map, keyframe and picture of those that settled since the last call (or all that remain), each once."""
-        return [(slam, k, frame) for slam in self._all() for k, frame in slam.take_settled_keyframes(everything)]
+        found: list[tuple[Slam, int, Frame]] = []
+        for slam in self._all():
+            if everything or not self._is_young(slam):
+                found += [(slam, k, frame) for k, frame in slam.take_settled_keyframes(everything or slam in self.left)]
+        return found

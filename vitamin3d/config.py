@@ -26,6 +26,10 @@ CHOICES = {
     "calibration.refine": ("auto", "on", "off"),
 }
 AT_LEAST_ONE = (
+    "continuity.reduction",
+    "relocalization.interval",
+    "relocalization.keyframes",
+    "relocalization.stride",
     "extrema.refill_interval",
     "dominant_flow.reduction",
     "extrema_tracking.flow_reduction",
@@ -180,6 +184,20 @@ class LocalizationConfig:
 
 
 @dataclass(frozen=True)
+class RotationConfig:
+    """A camera that turns without travelling is followed as that, by tracks without depth. Not in the paper."""
+
+    enabled: bool = True
+    min_tracks: int = 50
+    """That agree on the rotation;"""
+    min_share: float = 0.6
+    """and this share of all: parallax disagrees."""
+    sigma_px: float = 1.5
+    min_turn_deg: float = 5.0
+    """Of a camera without a map that is said to turn."""
+
+
+@dataclass(frozen=True)
 class KeyframeConfig:
     """When a frame becomes a keyframe."""
 
@@ -196,6 +214,9 @@ class TriangulationConfig:
 
     min_parallax_deg: float = 1.0
     max_reprojection_px: float = 3.0
+    max_rms_px: float = 1.5
+    """Of all its observations in the last `checked_keyframes`; 0: the first and the newest alone are looked at."""
+    checked_keyframes: int = 40
     min_observations: int = 2
 
 
@@ -222,8 +243,16 @@ class RelocalizationConfig:
 
     enabled: bool = True
     keyframes: int = 6
-    """The newest that are tried."""
-    corners: int = 2000
+    """So many are tried at a time: the newest, later older ones."""
+    stride: int = 4
+    """Of the older keyframes every so many-th is remembered,"""
+    max_remembered: int = 60
+    """so many at most."""
+    tries_at_once: int = 3
+    """In the first so many lost frames; then"""
+    interval: int = 5
+    """in each so many-th."""
+    corners: int = 1500
     max_distance_px: float = 3.0
     """Between a keyframe's corner and the landmark that it lends."""
     min_inliers: int = 25
@@ -594,6 +623,7 @@ class Config:
     continuity: ContinuityConfig = field(default_factory=ContinuityConfig)
     initialization: InitializationConfig = field(default_factory=InitializationConfig)
     localization: LocalizationConfig = field(default_factory=LocalizationConfig)
+    rotation: RotationConfig = field(default_factory=RotationConfig)
     keyframes: KeyframeConfig = field(default_factory=KeyframeConfig)
     triangulation: TriangulationConfig = field(default_factory=TriangulationConfig)
     recovery: RecoveryConfig = field(default_factory=RecoveryConfig)
@@ -627,6 +657,8 @@ def paper_config() -> Config:
         extrema_tracking=ExtremaTrackingConfig(prediction="dominant_flow", gate_px=8.0, gate_medians=0.0, min_roundness=0.0, coast_frames=0),
         continuity=ContinuityConfig(enabled=False),
         localization=LocalizationConfig(prior_inlier_ratio=2.0, outlier_medians=100.0, votes=0),
+        triangulation=TriangulationConfig(max_rms_px=0.0),
+        rotation=RotationConfig(enabled=False),
         recovery=RecoveryConfig(enabled=False),
         relocalization=RelocalizationConfig(enabled=False),
         window=WindowConfig(keyframes=20, anchors=0),

@@ -9,8 +9,8 @@ from types import FrameType
 from rich.console import Console
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TaskID, TextColumn, TimeElapsedColumn, TimeRemainingColumn
 
+from vitamin3d.atlas import Atlas
 from vitamin3d.datasets.pictures import Unreadable
-from vitamin3d.slam import Slam
 from vitamin3d.warmup import warm_up
 
 SECONDS_BETWEEN_LINES = 5.0
@@ -41,8 +41,10 @@ class ConsoleObserver:
         self._progress.stop()
         signal.signal(signal.SIGINT, self._handler)
 
-    def frame_done(self, done: int, total: int, slam: Slam) -> None:
-        note = f"{slam.state.value}, {slam.map.num_keyframes} keyframes, {len(slam.tracks)} tracks"
+    def frame_done(self, done: int, total: int, atlas: Atlas) -> None:
+        slam, num_maps = atlas.current, len(atlas.ranked())
+        maps = f"{num_maps} maps, the newest with " if num_maps > 1 else ""
+        note = f"{slam.state.value}, {maps}{slam.map.num_keyframes} keyframes, {len(slam.tracks)} tracks"
         self._show("tracking and mapping", done, total, note)
 
     def keyframe_done(self, done: int, total: int) -> None:

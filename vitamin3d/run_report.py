@@ -8,6 +8,7 @@ from typing import Any
 import cv2
 import numpy as np
 
+from vitamin3d.atlas import Atlas
 from vitamin3d.datasets.base import Dataset
 from vitamin3d.datasets.pictures import Unreadable
 from vitamin3d.datasets.point_files import read_geometry
@@ -23,8 +24,9 @@ from vitamin3d.exporters.files import write_file
 from vitamin3d.exporters.line_plot import Axes, Line, line_plot
 from vitamin3d.exporters.mesh import read_ply
 from vitamin3d.exporters.rendering import jpeg
-from vitamin3d.exporters.report import Picture, Report, evaluation_section, report_html, with_evaluation
+from vitamin3d.exporters.report import Picture, Report, evaluation_section, report_html, section_table, with_evaluation
 from vitamin3d.geometry.rolling_shutter import measured_pixels
+from vitamin3d.run_statistics import largest_map
 from vitamin3d.runtime import RunRecord
 from vitamin3d.slam import Slam
 from vitamin3d.timestamps import seconds_from_nanoseconds
@@ -37,12 +39,13 @@ MAPPED, WAITING = (60, 220, 90), (250, 190, 40)
 NO_TRAJECTORY = Trajectory(np.zeros(0, np.int64), np.zeros((0, 4, 4)))
 
 
-def write_report(out: Path, dataset: Dataset, slam: Slam, record: RunRecord) -> None:
-    """Writes `report.html` beside the other files of a run.
+def write_report(out: Path, dataset: Dataset, atlas: Atlas, record: RunRecord) -> None:
+    """Writes `report.html` beside the other files of a run; it shows the largest map.
 
     Raises:
         OutputError: it cannot be written.
     """
+    slam = largest_map(atlas)
     chosen = np.unique(np.linspace(0, max(0, slam.map.num_keyframes - 1), min(NUM_PICTURES, slam.map.num_keyframes)).astype(int))
     frames = [p for k in chosen if (p := _tracked_extrema(dataset, slam, int(k))) is not None]
     stamps = [seconds_from_nanoseconds(slam.map.timestamps_ns[k]) for k in chosen]
@@ -93,7 +96,7 @@ def _report(out: Path, dataset: Dataset, frames: list[Picture], stamps: list[str
     points, colors = _cloud(out / "cloud.ply")
     camera = dataset.camera
     return Report(
-        f"{dataset.name}: {len(trajectory)} of {stats['frames']} frames localised",
+        f"{dataset.name}: {stats['tracked_frames']} of {stats['frames']} frames localised{_in_maps(stats['maps'])}",
         f"vitamin3d {stats['versions'].get('vitamin3d', '')}, mode {stats.get('mode', 'default')}; unit: {stats['unit']}",
         _cards(stats, surface),
         keyframes.T_world_cam,
@@ -108,13 +111,45 @@ def _report(out: Path, dataset: Dataset, frames: list[Picture], stamps: list[str
         stats["steps"],
         json.dumps(stats, indent=2),
         read_text(out / "config.toml") if (out / "config.toml").is_file() else "",
+        _sections(stats),
     )
+
+
+def _in_maps(maps: list[dict[str, Any]]) -> str:
+    return f" in {len(maps)} maps, of which this is the largest" if len(maps) > 1 else ""
+
+
+def _sections(stats: dict[str, Any]) -> list[str]:
+    """Tables of what else there is to say."""
+    maps = stats["maps"]
+    return [_maps_section(maps)] if len(maps) > 1 else []  # the frames that are not localised, from run_gaps, come after it
+
+
+def _maps_section(maps: list[dict[str, Any]]) -> str:
+    """The maps of a run, the largest first; times count from the first localised frame."""
+    begin = min(entry["first_frame_s"] for entry in maps)
+    heads = ("map", "folder", "frames", "from s", "to s", "keyframes", "points", "unit")
+    rows = [
+        (
+            entry["number"],
+            entry["folder"],
+            f"{entry['frames']:,}",
+            f"{entry['first_frame_s'] - begin:.2f}",
+            f"{entry['last_frame_s'] - begin:.2f}",
+            f"{entry['keyframes']:,}",
+            f"{entry['cloud_points']:,}",
+            "metre" if entry["scale"]["known"] else "its own",
+        )
+        for entry in maps
+    ]
+    return section_table("Maps", heads, rows)
 
 
 def _cards(stats: dict[str, Any], surface: Surface | None) -> list[tuple[str, str]]:
     rate = stats["processed_frames"] / stats["wall_seconds"] if stats["wall_seconds"] else 0.0
     cards = [
         (f"{100 * stats['success_rate']:.1f} %", "frames localised"),
+        (f"{len(stats['maps'])}", "maps" if len(stats["maps"]) != 1 else "map"),
         (f"{stats['keyframes']:,}", "keyframes"),
         (f"{stats['cloud_points']:,}", "points"),
         (f"{0 if surface is None else len(surface.triangles):,}", "triangles"),

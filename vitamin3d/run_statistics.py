@@ -10,12 +10,15 @@ from typing import Any
 
 import numpy as np
 
+from vitamin3d.atlas import Atlas
+from vitamin3d.exporters.output_folder import MAPS
 from vitamin3d.geometry.camera import Camera
+from vitamin3d.map_output import MapOutput
 from vitamin3d.mapping.calibration_refinement import CalibrationRefinement
 from vitamin3d.runtime import RunRecord, median_of
 from vitamin3d.scale import Scale
 from vitamin3d.slam import Slam
-from vitamin3d.types import Array, StepTimes
+from vitamin3d.types import Array, SlamState, StepTimes
 
 PACKAGES = ("vitamin3d", "numpy", "scipy", "numba", "opencv-python-headless", "open3d", "pymeshlab")
 
@@ -105,30 +108,82 @@ def _spread(values: Array) -> dict[str, float]:
     return {name: round(float(np.percentile(values, share)), 3) for name, share in (("median", 50), ("p95", 95), ("worst", 100))}
 
 
-def run_statistics(
-    slam: Slam, record: RunRecord, scale: Scale, cloud_points: int, times: list[StepTimes], watch: Stopwatch
-) -> dict[str, Any]:
-    """The report of a run as a JSON object; lengths in metres where the scale is known."""
-    tracked, metres = len(slam.poses), scale.metres_per_unit if scale.is_known else None
+def map_table(slam: Slam, rank: int, output: MapOutput) -> dict[str, Any]:
+    """What there is of a map; the first is the largest. Its times are those of `trajectory.tum`."""
+    stamps = slam.trajectory().timestamps_ns
+    return {
+        "number": rank,
+        "folder": "." if rank == 1 else f"{MAPS}/{rank}",
+        "birth": slam.number,
+        "frames": len(slam.poses),
+        "first_frame_s": float(stamps[0]) / 1e9 if len(stamps) else None,
+        "last_frame_s": float(stamps[-1]) / 1e9 if len(stamps) else None,
+        "keyframes": slam.map.num_keyframes,
+        "landmarks": _num_landmarks(slam),
+        "cloud_points": output.cloud_points,
+        "voxels": output.voxels(),
+        "empty_meshes": output.empty_meshes,
+        "scale": _scale_table(output.scale),
+    }
+
+
+def _num_landmarks(slam: Slam) -> int:
+    return int(np.isfinite(slam.map.points_world[:, 0]).sum())
+
+
+def _scale_table(scale: Scale) -> dict[str, Any]:
+    return {"known": scale.is_known, "metres_per_map_unit": scale.metres_per_unit if scale.is_known else None, "source": scale.source}
+
+
+TRACKED = (SlamState.TRACKING, SlamState.UNCERTAIN)
+
+
+def frame_table(record: RunRecord) -> dict[str, float | None]:
+    """Median milliseconds of the frames in which the camera was tracked, and of the others; each with the median of the front end."""
+    ahead = float(np.median(record.front_end_seconds)) if record.front_end_seconds else 0.0
+    table: dict[str, float | None] = {}
+    for name, is_tracked in (("tracked", True), ("not_localised", False)):
+        seconds = [each for state, each in record.frame_seconds if (state in TRACKED) is is_tracked]
+        table[name] = round(1e3 * (float(np.median(seconds)) + ahead), 3) if seconds else None
+    return table
+
+
+def num_localised(atlas: Atlas) -> int:
+    """Frames that are localised in any of the maps."""
+    return len({stamp for slam in atlas.ranked() for stamp in slam.trajectory().timestamps_ns.tolist()})
+
+
+def run_statistics(atlas: Atlas, record: RunRecord, output: MapOutput, times: list[StepTimes], watch: Stopwatch) -> dict[str, Any]:
+    """The report of a run as a JSON object; lengths in metres where the scale is known.
+
+    Frames are those of all maps; keyframes, landmarks, points, calibration and scale are of the largest, whose output is given.
+    """
+    tracked, slam, scale = num_localised(atlas), largest_map(atlas), output.scale
     return {
         "frames": record.num_frames,
         "processed_frames": len(record.states),
         "unreadable_frames": len(record.skipped),
         "tracked_frames": tracked,
         "success_rate": round(tracked / max(1, record.num_frames), 6),
-        "state": slam.state.value,
+        "state": atlas.current.state.value,
         "interrupted": record.interrupted,
         "initialization_retries": slam.initialization_retries,
         "initialization_failure": slam.initialization_reason,
         "keyframes": slam.map.num_keyframes,
-        "landmarks": int(np.isfinite(slam.map.points_world[:, 0]).sum()),
-        "cloud_points": cloud_points,
+        "landmarks": _num_landmarks(slam),
+        "cloud_points": output.cloud_points,
         "median_live_tracks": median_of(record.live_tracks),
+        "frame_milliseconds": frame_table(record),
         "calibration": calibration_table(slam.camera, slam.calibration),
-        "scale": {"known": scale.is_known, "metres_per_map_unit": metres, "source": scale.source},
+        "scale": _scale_table(scale),
         "unit": scale.unit if scale.is_known else "map unit (up to scale)",
         "steps": step_table(*times),
         **watch.seconds(),
         "peak_memory_mb": round(resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024, 1),
         "versions": versions(),
     }
+
+
+def largest_map(atlas: Atlas) -> Slam:
+    """The map with most frames; the one that is being begun where there is none."""
+    return next(iter(atlas.ranked()), atlas.current)

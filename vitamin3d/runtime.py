@@ -8,6 +8,7 @@ keyframes for which the dense half has no time are not meshed.
 """
 
 import gc
+import time
 from collections.abc import Callable, Iterable, Iterator
 from contextlib import ExitStack
 from dataclasses import dataclass, field
@@ -16,6 +17,7 @@ from typing import Protocol
 import cv2
 import numpy as np
 
+from vitamin3d.atlas import Atlas
 from vitamin3d.datasets.base import Dataset
 from vitamin3d.datasets.pictures import Unreadable
 from vitamin3d.mapping.window_adjustment import AdjustAtOnce, WindowAdjustment
@@ -29,8 +31,8 @@ SNAPSHOTS_AHEAD, LIVE_SNAPSHOTS_AHEAD = 8, 3
 ADJUSTMENT_NICENESS, DENSE_NICENESS = 3, 10
 """In live runs the front end comes first, then the map, then the mesh."""
 
-KeyframeHand = Callable[[int, Frame, bool], None]
-"""Takes a settled keyframe and its picture; True: the recording is over."""
+KeyframeHand = Callable[[Slam, int, Frame, bool], None]
+"""Takes a settled keyframe of a map and its picture; True: the recording is over."""
 SnapshotConsumer = Callable[[Iterator[MapSnapshot | NewestFrame]], None]
 """Consumes keyframes as they come, on a thread of its own; in live runs, while none comes, it hears how late it is."""
 TimeHand = Callable[[int], None]
@@ -41,7 +43,7 @@ SnapshotSink = Callable[[MapSnapshot], None]
 class Observer(Protocol):
     """Who is told how a run goes; called on the thread that maps."""
 
-    def frame_done(self, done: int, total: int, slam: Slam) -> None: ...
+    def frame_done(self, done: int, total: int, atlas: Atlas) -> None: ...
 
     def frame_skipped(self, reason: Unreadable) -> None: ...
 
@@ -53,7 +55,7 @@ class Observer(Protocol):
 class SilentObserver:
     """Hears nothing and never stops a run."""
 
-    def frame_done(self, done: int, total: int, slam: Slam) -> None:
+    def frame_done(self, done: int, total: int, atlas: Atlas) -> None:
         pass
 
     def frame_skipped(self, reason: Unreadable) -> None:
@@ -75,6 +77,10 @@ class RunRecord:
     skipped: list[Unreadable] = field(default_factory=list)
     live_tracks: list[int] = field(default_factory=list)
     states: list[SlamState] = field(default_factory=list)
+    frame_seconds: list[tuple[SlamState, float]] = field(default_factory=list)
+    """State after a frame, and how long tracking and mapping it took, the front end not counted."""
+    front_end_seconds: list[float] = field(default_factory=list)
+    """Of each frame; on a thread of its own where there are threads."""
     interrupted: bool = False
     tracks: list[tuple[int, Array, Array]] | None = None
     """Frame index, ids (N,) and distorted pixels (N, 2) per frame, where they are kept."""
@@ -91,8 +97,8 @@ class RunRecord:
 class _Run:
     """The steps of a run on the mapping thread, shared by all ways of running."""
 
-    def __init__(self, slam: Slam, record: RunRecord, observer: Observer, hand: KeyframeHand, clock: Clock | None = None) -> None:
-        self.slam, self.record, self.observer, self.hand, self.clock = slam, record, observer, hand, clock
+    def __init__(self, atlas: Atlas, record: RunRecord, observer: Observer, hand: KeyframeHand, clock: Clock | None = None) -> None:
+        self.atlas, self.record, self.observer, self.hand, self.clock = atlas, record, observer, hand, clock
         self.tell_time: TimeHand = lambda timestamp_ns: None
 
     def all_frames(self, fronts: Iterable[FrontEndFrame | Unreadable]) -> RunRecord:
@@ -103,7 +109,7 @@ class _Run:
                 break
             self.frame(front)
         with step("mapping"):
-            self.slam.take_adjustment(wait=True)
+            self.atlas.take_adjustment(wait=True)
         self.hand_over(everything=True)
         return self.record
 
@@ -112,33 +118,37 @@ class _Run:
             self.record.skipped.append(front)
             self.observer.frame_skipped(front)
         else:
+            begun = time.perf_counter()
             with step(f"tracking and mapping frame {front.frame.index}"):
-                self.record.states.append(self.slam.process_frame(front))
+                state = self.atlas.process_frame(front)
+            self.record.states.append(state)
+            self.record.frame_seconds.append((state, time.perf_counter() - begun))
             if self.clock is not None and self.record.latencies is not None:
                 self.record.latencies.append((front.frame.index, self.clock.seconds_since(front.frame.timestamp_ns)))
             self._record_tracks(front.frame.index)
             self.hand_over()
             self.tell_time(front.frame.timestamp_ns)
         done = len(self.record.skipped) + len(self.record.states)
-        self.observer.frame_done(done, self.record.num_frames, self.slam)
+        self.observer.frame_done(done, self.record.num_frames, self.atlas)
 
     def hand_over(self, everything: bool = False) -> None:
         """Keyframes that nothing will move any more go to the dense half."""
-        for keyframe, frame in self.slam.take_settled_keyframes(everything):
-            self.hand(keyframe, frame, everything)
+        for slam, keyframe, frame in self.atlas.take_settled_keyframes(everything):
+            self.hand(slam, keyframe, frame, everything)
 
     def _record_tracks(self, frame_index: int) -> None:
-        seen = self.slam.tracks.select(self.slam.tracks.missed == 0)
+        slam = self.atlas.current
+        seen = slam.tracks.select(slam.tracks.missed == 0)
         self.record.live_tracks.append(len(seen))
         if self.record.tracks is not None:
-            self.record.tracks.append((frame_index, self.slam.unique_ids(seen.ids), seen.pixels))
+            self.record.tracks.append((frame_index, slam.unique_ids(seen.ids), seen.pixels))
 
 
 def run_sequential(
     dataset: Dataset,
     indices: range,
     front_end: FrontEnd,
-    slam: Slam,
+    atlas: Atlas,
     sink: SnapshotSink | None = None,
     observer: Observer | None = None,
     record: RunRecord | None = None,
@@ -146,7 +156,7 @@ def run_sequential(
     """Runs the frames `indices` of a dataset, one step after the other.
 
     Args:
-        sink: gets each keyframe once the window has left it, in order; None: the caller asks `slam` afterwards.
+        sink: gets each keyframe once the window has left it, in order; None: the caller asks `atlas` afterwards.
         observer: hears of each frame and may stop the run.
         record: is filled while the run lasts, so that it is there when a step fails; it keeps tracks where it has a list for them.
 
@@ -154,15 +164,15 @@ def run_sequential(
         WorkerError: a step failed; it names the step.
     """
     record = _begin(indices, record)
-    run = _Run(slam, record, observer or SilentObserver(), _hand_to(slam, record, sink))
-    return run.all_frames(_front_frames(_pictures(dataset, indices), front_end))
+    run = _Run(atlas, record, observer or SilentObserver(), _hand_to(record, sink))
+    return run.all_frames(_front_frames(_pictures(dataset, indices), front_end, record))
 
 
 def run_threaded(
     dataset: Dataset,
     indices: range,
     front_end: FrontEnd,
-    slam: Slam,
+    atlas: Atlas,
     sink: SnapshotSink | None = None,
     observer: Observer | None = None,
     record: RunRecord | None = None,
@@ -171,15 +181,15 @@ def run_threaded(
     record = _begin(indices, record)
     with ExitStack() as threads:
         put = threads.enter_context(Consumer(_each_to(sink), "dense", SNAPSHOTS_AHEAD)).put if sink else None
-        fronts = threads.enter_context(_fronts_ahead(threads, _pictures(dataset, indices), front_end, None))
-        return _Run(slam, record, observer or SilentObserver(), _hand_to(slam, record, put)).all_frames(fronts)
+        fronts = threads.enter_context(_fronts_ahead(threads, _pictures(dataset, indices), front_end, record))
+        return _Run(atlas, record, observer or SilentObserver(), _hand_to(record, put)).all_frames(fronts)
 
 
 def run_live(
     dataset: Dataset,
     indices: range,
     front_end: FrontEnd,
-    slam: Slam,
+    atlas: Atlas,
     consume: SnapshotConsumer | None = None,
     observer: Observer | None = None,
     record: RunRecord | None = None,
@@ -203,16 +213,16 @@ def run_live(
         dense = threads.enter_context(Consumer(consume, "dense", LIVE_SNAPSHOTS_AHEAD, DENSE_NICENESS)) if consume else None
         if clock is not None:
             adjuster: Errand[WindowAdjustment] = Errand("adjustment", ADJUSTMENT_NICENESS)
-            slam.adjuster = threads.enter_context(adjuster)
-            threads.callback(setattr, slam, "adjuster", AdjustAtOnce())
-        fronts = threads.enter_context(_fronts_ahead(threads, _pictures(dataset, indices), front_end, clock))
+            atlas.use_adjuster(threads.enter_context(adjuster))
+            threads.callback(lambda: atlas.use_adjuster(AdjustAtOnce()))
+        fronts = threads.enter_context(_fronts_ahead(threads, _pictures(dataset, indices), front_end, record, clock))
         if clock is not None:
             threads.callback(clock.cancel)
-        run = _Run(slam, record, observer or SilentObserver(), _hand_or_drop(slam, record, dense), clock)
+        run = _Run(atlas, record, observer or SilentObserver(), _hand_or_drop(record, dense), clock)
         if dense is not None:
             run.tell_time = _tell_while_waiting(dense)
         run.all_frames(fronts)
-        record.adjustments_awaited = slam.adjustments_awaited
+        record.adjustments_awaited = atlas.adjustments_awaited
         return record
 
 
@@ -231,7 +241,7 @@ def _pictures(dataset: Dataset, indices: range) -> Iterator[Frame | Unreadable]:
 
 
 def _front_frames(
-    pictures: Iterable[Frame | Unreadable], front_end: FrontEnd, clock: Clock | None = None
+    pictures: Iterable[Frame | Unreadable], front_end: FrontEnd, record: RunRecord, clock: Clock | None = None
 ) -> Iterator[FrontEndFrame | Unreadable]:
     for picture in pictures:
         if isinstance(picture, Unreadable):
@@ -240,13 +250,17 @@ def _front_frames(
         if clock is not None:
             clock.wait_for(picture.timestamp_ns)
         with step(f"curvature and flow of frame {picture.index}"):
+            begun = time.perf_counter()
             front = front_end.process(picture)
+        record.front_end_seconds.append(time.perf_counter() - begun)
         yield front
 
 
-def _fronts_ahead(threads: ExitStack, pictures: Iterator[Frame | Unreadable], front_end: FrontEnd, clock: Clock | None) -> ReadAhead:
+def _fronts_ahead(
+    threads: ExitStack, pictures: Iterator[Frame | Unreadable], front_end: FrontEnd, record: RunRecord, clock: Clock | None = None
+) -> ReadAhead:
     decoded = threads.enter_context(ReadAhead(pictures, "decoding", READ_AHEAD))
-    return ReadAhead(_front_frames(decoded, front_end, clock), "front-end", READ_AHEAD, upstream=decoded)
+    return ReadAhead(_front_frames(decoded, front_end, record, clock), "front-end", READ_AHEAD, upstream=decoded)
 
 
 def _each_to(sink: SnapshotSink) -> SnapshotConsumer:
@@ -267,10 +281,10 @@ def _tell_while_waiting(dense: Consumer) -> TimeHand:
     return tell
 
 
-def _hand_to(slam: Slam, record: RunRecord, sink: SnapshotSink | None) -> KeyframeHand:
+def _hand_to(record: RunRecord, sink: SnapshotSink | None) -> KeyframeHand:
     """Every keyframe goes to `sink`, which may take its time."""
 
-    def hand(keyframe: int, frame: Frame, _: bool) -> None:
+    def hand(slam: Slam, keyframe: int, frame: Frame, _: bool) -> None:
         if sink is not None:
             record.keyframes_offered += 1
             with step(f"meshing and fusing frame {frame.index}"):
@@ -279,10 +293,10 @@ def _hand_to(slam: Slam, record: RunRecord, sink: SnapshotSink | None) -> Keyfra
     return hand
 
 
-def _hand_or_drop(slam: Slam, record: RunRecord, dense: Consumer | None) -> KeyframeHand:
+def _hand_or_drop(record: RunRecord, dense: Consumer | None) -> KeyframeHand:
     """A keyframe for which the dense half has no room is dropped, unless the recording is over."""
 
-    def hand(keyframe: int, frame: Frame, is_over: bool) -> None:
+    def hand(slam: Slam, keyframe: int, frame: Frame, is_over: bool) -> None:
         if dense is None:
             return
         record.keyframes_offered += 1

@@ -26,7 +26,8 @@ from vitamin3d.mapping.map_initialization import add_view, build_first_map
 from vitamin3d.mapping.p3p_localization import localize, localize_by, voters
 from vitamin3d.mapping.pose_log import PoseLog
 from vitamin3d.mapping.readout_estimation import set_image_motion
-from vitamin3d.mapping.relocalization import relocalize
+from vitamin3d.mapping.relocalization import RememberedKeyframes, is_search_due, relocalize
+from vitamin3d.mapping.rotation_tracking import Directions, Turns, rotation_of
 from vitamin3d.mapping.sparse_map import SparseMap
 from vitamin3d.mapping.two_view_initialization import initialize_from_two_views
 from vitamin3d.mapping.visible_landmarks import with_unobserved
@@ -60,6 +61,10 @@ class Slam:
         self._past = WindowPrior(config)
         self._history = InitializationHistory(config.initialization)
         self._pending_frames: dict[int, Frame] = {}
+        self._directions, self._turns = Directions(), Turns()
+        self._remembered = RememberedKeyframes(config.relocalization)
+        self.num_lost = 0
+        """Frames in a row in which the camera was not found, less one."""
         self._meetings: list[Array] = []
         self._image_motion, self._last_ns = NO_MOTION, 0
         self._last_seen: tuple[tuple[Tracks, Array, Camera], tuple[Tracks, Array]] = (
@@ -78,7 +83,7 @@ class Slam:
         self._condense_when_due()
         with self.times.timed("track_extrema"):
             self.tracks = self._track(front)
-        if self.state is SlamState.INITIALIZING:
+        if self.map.num_keyframes == 0:
             self._refill_when_due(front)
             with self.times.timed("initialize"):
                 self._initialize(front)
@@ -89,6 +94,7 @@ class Slam:
             if T_cam_world is not None:
                 with self.times.timed("map"):
                     self._map(front, T_cam_world)
+                    self._directions.note(*self._seen_ids(), self.poses.newest(self.map)[:3, :3], self.camera)
         self._frame_count += 1
         self._newest_frame = front.frame.index
         return self.state
@@ -152,6 +158,11 @@ class Slam:
         valid = np.isfinite(pixels[:, 0])
         return seen.select(valid), pixels[valid]
 
+    def _seen_ids(self) -> tuple[Array, Array]:
+        """Their ids and ideal pixels."""
+        seen, pixels = self._seen()
+        return seen.ids, pixels
+
     def _end_tracks(self, ids: Array) -> None:
         if len(ids):
             self.tracks = self.tracks.select(~np.isin(self.tracks.ids, ids, kind="table"))
@@ -160,6 +171,7 @@ class Slam:
 
     def _initialize(self, front: FrontEndFrame) -> None:
         """The first map from two frames; the frames before it are localised against it."""
+        self._turn_on(front.frame)
         self._history.append(TrackedView(front.frame, *self._seen(), self._image_motion))
         ids, pixels_0, pixels_1 = self._history.pair()
         if not self._history.is_worth_a_try(pixels_0, pixels_1):
@@ -172,11 +184,27 @@ class Slam:
             return
         self.map, self.state, self.initialization_reason = first.map, SlamState.TRACKING, ""
         self._pending_frames = {k: view.frame for k, view in enumerate(first.keyframe_views)}
+        for k, frame in self._pending_frames.items():
+            self._remembered.add(k, frame)
         self._log_history()
         self._history.views.clear()
+        self._turns, self._directions = Turns(), Directions()
+
+    def _turn_on(self, frame: Frame) -> None:
+        """Before there is a map: the rotation since the chain of frames began in which the camera did no more than turn."""
+        seen, pixels = self._seen()
+        R = rotation_of(self._directions.of(seen.ids), pixels, self._turns.newest, self.camera, self.config.rotation)
+        if R is None:
+            self._turns, self._directions, R = Turns(), Directions(), np.eye(3)
+        self._turns.add(frame, R)
+        self._directions.note(seen.ids, pixels, R, self.camera)
+        has_turned = self._turns.has_turned(self.config.rotation)
+        self.state = SlamState.ROTATING if has_turned else SlamState.INITIALIZING
 
     def _log_history(self) -> None:
         """Localises the frames from before the map against it: their tracks were kept."""
+        for frame, R in self._turns.since(self.map.frame_indices[0]):
+            self.poses.add(frame, 0, R)
         keyframe_of_frame = {index: k for k, index in enumerate(self.map.frame_indices)}
         for view in self._history.views:
             k = keyframe_of_frame.get(view.frame.index)
@@ -196,13 +224,37 @@ class Slam:
         ids, seed = seen.ids[mapped], self.config.seed + front.frame.index
         found = self._pose_of_votes(ids, pixels[mapped], self.poses.predict(self.map), seed)
         if not found.converged or found.is_inlier.sum() < self.config.localization.min_kept_ratio * self.map.is_mapped(self.tracks.ids).sum():
-            return self._find_camera(front)
+            return self._rotate(front, seen, pixels)
         self.state = SlamState.TRACKING
         self._end_tracks(ids[~found.is_inlier])
         recovery = self.config.recovery
         if recovery.enabled and self._frame_count % recovery.interval == 0 and self._recover(front, found.T_cam_world):
             return self._relocalize(found.T_cam_world)
         return found.T_cam_world
+
+    def _rotate(self, front: FrontEndFrame, seen: Tracks, pixels: Array) -> Array | None:
+        """Where the landmarks have left the picture but it only turned, its frame is logged; else the camera must be found.
+
+        Returns the pose of the latter: nothing is added to the map by a turn.
+        """
+        T_cam_world = None
+        if self.config.rotation.enabled and self.state is not SlamState.LOST:
+            T_cam_world = self._turned(seen, pixels, self.poses.newest(self.map))
+        if T_cam_world is None:
+            return self._find_camera(front)
+        self.state = SlamState.ROTATING
+        self.poses.add_world(front.frame, T_cam_world, self.map)
+        self._directions.note(seen.ids, pixels, T_cam_world[:3, :3], self.camera)
+        return None
+
+    def _turned(self, seen: Tracks, pixels: Array, T_before: Array) -> Array | None:
+        """T_cam_world of a camera that turned on the spot."""
+        R = rotation_of(self._directions.of(seen.ids), pixels, T_before[:3, :3], self.camera, self.config.rotation)
+        if R is None:
+            return None
+        T = np.eye(4)
+        T[:3, :3], T[:3, 3] = R, R @ T_before[:3, :3].T @ T_before[:3, 3]
+        return T
 
     def _pose_of_votes(self, ids: Array, pixels: Array, T_prior: Array, seed: int = 0) -> Localization:
         """The pose by landmarks (N,) ids at ideal pixels (N, 2), those with many observations deciding."""
@@ -212,17 +264,18 @@ class Slam:
 
     def _find_camera(self, front: FrontEndFrame) -> Array | None:
         """T_cam_world of a frame whose tracks broke: descriptors, then a search for the landmarks themselves; or LOST."""
-        self.state, settings = SlamState.LOST, self.config.relocalization
-        if not settings.enabled:
+        settings = self.config.relocalization
+        self.num_lost = self.num_lost + 1 if self.state is SlamState.LOST else 0
+        self.state = SlamState.LOST
+        if not settings.enabled or not is_search_due(self.num_lost, settings):
             return None
-        keyframes = sorted(self._pending_frames.items())[-settings.keyframes :]
         strictness = replace(
             self.config.localization,
             min_inliers=settings.min_inliers,
             min_inlier_ratio=settings.min_inlier_ratio,
             ransac_iterations=settings.ransac_iterations,
         )
-        found = relocalize(front.frame, keyframes, self.map, self.camera, settings, strictness)
+        found = relocalize(front.frame, self._remembered.to_try(self.num_lost), self.map, self.camera, settings, strictness)
         if not found.converged:
             return None
         self.tracks = Tracks.empty()
@@ -286,6 +339,7 @@ class Slam:
         keyframe = add_view(self.map, TrackedView(front.frame, *self._seen(), self._image_motion), T_cam_world)
         self._pending_frames[keyframe] = front.frame
         self._pending_frames.pop(keyframe - UNTAKEN_WINDOWS * self.config.window.keyframes, None)
+        self._remembered.add(keyframe, front.frame)
         return keyframe
 
     def _merge_landmarks(self, T_cam_world: Array) -> None:
@@ -332,7 +386,7 @@ class Slam:
     def _condense_when_due(self) -> None:
         """Once in a while the map forgets what it can do without; ids and keyframes are numbered anew."""
         new_ids = self._next_id - self._num_condensed
-        if self.state is SlamState.INITIALIZING or not is_due(self.map, new_ids, self.config.memory):
+        if self.map.num_keyframes == 0 or not is_due(self.map, new_ids, self.config.memory):
             return
         with self.times.timed("condense"):
             self.take_adjustment(wait=True)
@@ -345,6 +399,8 @@ class Slam:
             self.tracks = replace(self.tracks, ids=renamed)
             self._meetings = [np.searchsorted(done.kept_ids, pair) for pair in self._meetings]
             self._pending_frames = {int(np.searchsorted(done.kept_keyframes, k)): f for k, f in self._pending_frames.items()}
+            self._directions = self._directions.renamed(done.kept_ids)
+            self._remembered.move_to(done.kept_keyframes)
             self._past.forget()
             self.map, self._next_id, self._num_condensed = done.map, len(done.kept_ids), len(done.kept_ids)
 

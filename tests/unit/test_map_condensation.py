@@ -6,12 +6,12 @@ import dataclasses
 import numpy as np
 import pytest
 
+from vitamin3d.atlas import Atlas
 from vitamin3d.config import Config, MemoryConfig
 from vitamin3d.mapping.map_condensation import condense, contributions, redundant_keyframes
 from vitamin3d.mapping.pose_log import PoseLog
 from vitamin3d.mapping.sparse_map import SparseMap
 from vitamin3d.runtime import RunRecord, run_sequential
-from vitamin3d.slam import Slam
 from vitamin3d.tracking.front_end import FrontEnd
 from vitamin3d.types import Frame
 
@@ -122,9 +122,9 @@ def test_poses_stay_where_they_were(rng):
 
 def run(demo, memory):
     config = Config(memory=memory)
-    slam, record = Slam(demo.camera, config), RunRecord(tracks=[])
-    run_sequential(demo, range(90), FrontEnd(config), slam, record=record)
-    return slam, record
+    atlas, record = Atlas(demo.camera, config), RunRecord(tracks=[])
+    run_sequential(demo, range(90), FrontEnd(config), atlas, record=record)
+    return atlas.ranked()[0], record
 
 
 @pytest.fixture(scope="module")
@@ -146,8 +146,9 @@ def test_forgetting_dead_tracks_changes_nothing(demo, unforgetting):
 
 def test_a_run_with_few_keyframes_goes_the_same_way(demo, unforgetting):
     config = Config(memory=MemoryConfig(max_keyframes=8), window=dataclasses.replace(Config().window, keyframes=1))
-    slam = Slam(demo.camera, config)
-    run_sequential(demo, range(90), FrontEnd(config), slam)
+    atlas = Atlas(demo.camera, config)
+    run_sequential(demo, range(90), FrontEnd(config), atlas)
+    slam = atlas.ranked()[0]
     assert slam.map.num_keyframes <= 9 and len(slam.times.milliseconds["condense"]) >= 1
     path, other = slam.trajectory(), unforgetting[0].trajectory()
     assert len(path) == len(other) == 90

@@ -11,7 +11,16 @@ from browser import opened
 from vitamin3d.errors import InputError
 from vitamin3d.exporters import report as module
 from vitamin3d.exporters.rendering import jpeg
-from vitamin3d.exporters.report import Picture, Report, decimated, evaluation_section, quantised, report_html, with_evaluation
+from vitamin3d.exporters.report import (
+    Picture,
+    Report,
+    decimated,
+    evaluation_section,
+    quantised,
+    report_html,
+    section_table,
+    with_evaluation,
+)
 from vitamin3d.run_report import read_truth_of
 from vitamin3d.types import Surface
 
@@ -64,6 +73,12 @@ def test_text_is_escaped_and_everything_is_there():
     assert scene["mesh"]["vertices"] == 3600 and scene["cloud"]["points"] == 1200 and len(scene["keyframes"]) == 5
     np.testing.assert_allclose(scene["up"], [0, -1, 0], atol=1e-9)
     assert scene["eye"][2] < scene["target"][2]
+
+
+def test_a_table_of_its_own_is_before_the_view():
+    page = report_html(report(sections=[section_table("Maps <2>", ("map", "frames"), [(1, "79"), (2, "<71>")])]))
+    assert "<h2>Maps &lt;2&gt;</h2><table><tr><th>map</th><th>frames</th></tr><tr><td>1</td><td>79</td></tr>" in page
+    assert "<td>&lt;71&gt;</td>" in page and page.index("Maps &lt;2&gt;") < page.index("<canvas")
 
 
 def test_a_large_mesh_is_made_coarser_until_it_fits(monkeypatch):

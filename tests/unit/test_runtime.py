@@ -8,16 +8,16 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
+from vitamin3d.atlas import Atlas
 from vitamin3d.config import Config, WindowConfig
 from vitamin3d.datasets.pictures import Unreadable
 from vitamin3d.errors import WorkerError
-from vitamin3d.job import Job, _Dense
-from vitamin3d.run_statistics import live_table
+from vitamin3d.map_output import MapOutput
+from vitamin3d.run_statistics import frame_table, largest_map, live_table
 from vitamin3d.runtime import RunRecord, SilentObserver, median_of, run_live, run_sequential, run_threaded
 from vitamin3d.scale import Scale
-from vitamin3d.slam import Slam
 from vitamin3d.tracking.front_end import FrontEnd
-from vitamin3d.types import MapSnapshot, NewestFrame, SlamState
+from vitamin3d.types import MapSnapshot, NewestFrame, SlamState, StepTimes
 from vitamin3d.workers import Clock
 
 CONFIG = Config(seed=3, window=WindowConfig(keyframes=2, anchors=3))  # a small window hands keyframes over early
@@ -42,7 +42,7 @@ class Watcher(SilentObserver):
     def __init__(self, stop_after=10**9):
         self.done, self.skipped, self.totals, self.stop_after = [], [], set(), stop_after
 
-    def frame_done(self, done, total, slam):
+    def frame_done(self, done, total, atlas):
         self.done.append(done)
         self.totals.add(total)
 
@@ -54,8 +54,10 @@ class Watcher(SilentObserver):
 
 
 def run(name, dataset, camera, count=60, **options):
-    slam = Slam(camera, CONFIG)
-    return slam, RUNS[name](dataset, range(count), FrontEnd(CONFIG), slam, **options)
+    """The largest map (or the one to be), and the record."""
+    atlas = Atlas(camera, CONFIG)
+    record = RUNS[name](dataset, range(count), FrontEnd(CONFIG), atlas, **options)
+    return largest_map(atlas), record
 
 
 def our_threads():
@@ -137,7 +139,7 @@ def test_an_exception_of_the_dataset_comes_out(demo, name):
 
 def test_an_exception_on_the_mapping_thread_comes_out(demo):
     class Broken(SilentObserver):
-        def frame_done(self, done, total, slam):
+        def frame_done(self, done, total, atlas):
             if done == 12:
                 raise KeyError("observer")
 
@@ -197,12 +199,13 @@ def test_live_no_frame_waits_for_a_dense_half_that_does_not_keep_up(demo):
         received.extend(snapshot.frame.index for snapshot in snapshots if isinstance(snapshot, MapSnapshot))
 
     class Opens(SilentObserver):
-        def frame_done(self, done, total, slam):
+        def frame_done(self, done, total, atlas):
             if done == 120:
                 go.set()
 
-    slam, record = Slam(demo.camera, CONFIG), RunRecord()
-    run_live(demo, range(120), FrontEnd(CONFIG), slam, consume, Opens(), record)
+    atlas, record = Atlas(demo.camera, CONFIG), RunRecord()
+    run_live(demo, range(120), FrontEnd(CONFIG), atlas, consume, Opens(), record)
+    slam = atlas.active
     assert len(record.states) == 120 and len(slam.trajectory()) > 110
     assert record.keyframes_offered == slam.map.num_keyframes and record.keyframes_dropped > 2
     assert len(received) == record.keyframes_offered - record.keyframes_dropped
@@ -213,7 +216,8 @@ def test_live_no_frame_waits_for_a_dense_half_that_does_not_keep_up(demo):
 def test_windows_are_adjusted_at_every_so_many_keyframes(demo, interval):
     adjustment = dataclasses.replace(CONFIG.bundle_adjustment, keyframe_interval=interval)
     config = dataclasses.replace(CONFIG, bundle_adjustment=adjustment)
-    slam, adjusted = Slam(demo.camera, config), []
+    atlas, adjusted = Atlas(demo.camera, config), []
+    slam = atlas.active
     adjust = slam._adjust_window
 
     def watched():
@@ -221,14 +225,16 @@ def test_windows_are_adjusted_at_every_so_many_keyframes(demo, interval):
         adjust()
 
     slam._adjust_window = watched
-    run_sequential(demo, range(90), FrontEnd(config), slam)
+    run_sequential(demo, range(90), FrontEnd(config), atlas)
+    assert slam is atlas.active
     assert len(adjusted) > 3 and adjusted[0] % interval == 0 and set(np.diff(adjusted)) == {interval}
     assert slam.map.num_keyframes - 1 - adjusted[-1] < interval
 
 
 def test_with_a_clock_windows_are_adjusted_beside_the_tracking(demo):
     at_each_keyframe = dataclasses.replace(CONFIG, bundle_adjustment=dataclasses.replace(CONFIG.bundle_adjustment, keyframe_interval=1))
-    slam, record = Slam(demo.camera, at_each_keyframe), RunRecord()
+    atlas, record = Atlas(demo.camera, at_each_keyframe), RunRecord()
+    slam = atlas.active
     threads, solved = set(), slam._solved
 
     def watched(*task):
@@ -237,7 +243,8 @@ def test_with_a_clock_windows_are_adjusted_beside_the_tracking(demo):
         return solved(*task)
 
     slam._solved = watched
-    run_live(demo, range(90), FrontEnd(CONFIG), slam, record=record, clock=Clock())
+    run_live(demo, range(90), FrontEnd(CONFIG), atlas, record=record, clock=Clock())
+    assert slam is atlas.active
     assert threads == {"vitamin3d-adjustment"} and not slam.adjuster.is_busy
     assert record.adjustments_awaited == slam.adjustments_awaited > 0
     reference, _ = run("sequential", demo, demo.camera, 90)
@@ -247,8 +254,9 @@ def test_with_a_clock_windows_are_adjusted_beside_the_tracking(demo):
 
 def test_without_a_clock_a_live_run_maps_like_a_sequential_one(demo):
     live, _ = run("sequential", demo, demo.camera, 60)
-    slam = Slam(demo.camera, CONFIG)
-    run_live(demo, range(60), FrontEnd(CONFIG), slam, lambda snapshots: [time.sleep(0.05) for _ in snapshots])
+    atlas = Atlas(demo.camera, CONFIG)
+    run_live(demo, range(60), FrontEnd(CONFIG), atlas, lambda snapshots: [time.sleep(0.05) for _ in snapshots])
+    slam = atlas.active
     np.testing.assert_array_equal(slam.trajectory().T_world_cam, live.trajectory().T_world_cam)
     np.testing.assert_array_equal(slam.map.points_world, live.map.points_world)
 
@@ -261,14 +269,14 @@ def test_live_a_dense_half_without_work_hears_how_late_it_is(demo):
             is_time = isinstance(item, NewestFrame)
             (times if is_time else frames).append(item.timestamp_ns if is_time else item.frame.timestamp_ns)
 
-    run_live(demo, range(60), FrontEnd(CONFIG), Slam(demo.camera, CONFIG), consume)
+    run_live(demo, range(60), FrontEnd(CONFIG), Atlas(demo.camera, CONFIG), consume)
     assert len(frames) > 2 and 10 < len(times) <= 60 and times == sorted(times)
     assert set(times) <= set(demo.timestamps_ns[:60].tolist())
 
 
 def test_pictures_come_when_they_are_due(demo):
     record, clock, begun = RunRecord(), Clock(), time.monotonic()
-    run_live(demo, range(30), FrontEnd(CONFIG), Slam(demo.camera, CONFIG), record=record, clock=clock)
+    run_live(demo, range(30), FrontEnd(CONFIG), Atlas(demo.camera, CONFIG), record=record, clock=clock)
     span = (demo.timestamps_ns[29] - demo.timestamps_ns[0]) / 1e9
     assert time.monotonic() - begun >= span
     assert [index for index, _ in record.latencies] == list(range(30)) and all(0 < seconds < 10 for _, seconds in record.latencies)
@@ -285,19 +293,27 @@ def test_a_stop_does_not_wait_for_the_next_picture(demo):
 
     begun = time.monotonic()
     with pytest.raises(KeyboardInterrupt):
-        run_live(Rare(), range(3), FrontEnd(CONFIG), Slam(demo.camera, CONFIG), observer=StopsSoon(), clock=Clock())
+        run_live(Rare(), range(3), FrontEnd(CONFIG), Atlas(demo.camera, CONFIG), observer=StopsSoon(), clock=Clock())
     assert time.monotonic() - begun < 20
 
 
 def test_lags_count_from_when_a_view_is_in_the_volume():
     """The first three wait for the choice of the voxels; how long is a figure of its own."""
     clock = SimpleNamespace(seconds_since=lambda timestamp_ns: 10.0 - timestamp_ns / 1e9)
-    dense = _Dense(SimpleNamespace(camera=None), Job(Config()), None, Scale(), clock)
+    dense = MapOutput(None, Config(), None, Scale(), StepTimes(), clock)
     first, later = ([SimpleNamespace(timestamp_ns=int(1e9 * t)) for t in times] for times in ((5.0, 6.0, 7.0), (8.5,)))
     for fused in ([], [], first, later):
-        dense._note_lags(fused)
+        dense.note_lags(fused)
     assert dense.mesh_begins == 5.0 and dense.mesh_lags == [1.5]
     record = RunRecord(latencies=[(0, 0.01), (1, 0.07)])
     table = live_table(record, dense.mesh_lags, dense.mesh_begins)["realtime"]
     assert table["mesh_begins_seconds"] == 5.0 and table["mesh_lag_seconds"]["worst"] == 1.5
     assert table["late_frames"] == [[1, 70.0]] and table["late_share"] == 0.5
+
+
+def test_frames_have_two_prices():
+    record = RunRecord(front_end_seconds=[0.004, 0.006, 0.005])
+    assert frame_table(record) == {"tracked": None, "not_localised": None}
+    states = (SlamState.INITIALIZING, SlamState.TRACKING, SlamState.UNCERTAIN, SlamState.TRACKING, SlamState.LOST)
+    record.frame_seconds = list(zip(states, (0.002, 0.010, 0.030, 0.012, 0.050), strict=True))
+    assert frame_table(record) == {"tracked": 17.0, "not_localised": 31.0}

@@ -20,6 +20,10 @@ if TYPE_CHECKING:
     from vitamin3d.job import Job, Outcome
 
 
+LOW_SUCCESS = 0.9
+"""A run that localises a smaller share of its frames is warned about."""
+
+
 class Mode(str, Enum):
     """Named settings."""
 
@@ -148,10 +152,11 @@ def _run(source: Path, calibration: Path | None, job: "Job", out: Path, overwrit
 def _conclude(outcome: "Outcome", out: Path) -> int:
     stats = outcome.stats
     if not outcome.has_map:
-        typer.echo(f"no map: {outcome.slam.initialization_reason} ({stats['processed_frames']} frames; see {out / 'stats.json'})", err=True)
+        reason = stats["initialization_failure"]
+        typer.echo(f"no map: {reason} ({stats['processed_frames']} frames; see {out / 'stats.json'})", err=True)
         return EXIT_INTERRUPTED if outcome.record.interrupted else EXIT_NO_MAP
     typer.echo(
-        f"{stats['tracked_frames']} of {stats['frames']} frames localised, {stats['keyframes']} keyframes, "
+        f"{stats['tracked_frames']} of {stats['frames']} frames localised{_in_maps(stats['maps'])}, {stats['keyframes']} keyframes, "
         f"{stats['cloud_points']} points, {stats['wall_seconds']:.0f} s; {outcome.scale.remark}"
     )
     if stats["live"]:
@@ -161,9 +166,23 @@ def _conclude(outcome: "Outcome", out: Path) -> int:
     for name in ("mesh_high.ply", "mesh_high.obj", "mesh_low.ply", "cloud.ply", "trajectory.tum"):
         if (out / name).exists():
             typer.echo(f"  {out / name}")
+    for entry in stats["maps"][1:]:
+        typer.echo(f"  {out / entry['folder']}: {entry['frames']} frames, {entry['keyframes']} keyframes, {entry['cloud_points']} points")
+    if stats["success_rate"] < LOW_SUCCESS and not outcome.record.interrupted:
+        typer.echo(_gaps_line(stats), err=True)
     if outcome.record.interrupted:
         return EXIT_INTERRUPTED
     return _say_empty_meshes(stats["empty_meshes"])
+
+
+def _in_maps(maps: list[dict[str, Any]]) -> str:
+    return f" in {len(maps)} maps (largest: {maps[0]['frames']})" if len(maps) > 1 else ""
+
+
+def _gaps_line(stats: dict[str, Any]) -> str:
+    """A warning about the frames that are not localised; which and why comes from run_gaps."""
+    missing = stats["frames"] - stats["tracked_frames"]
+    return f"warning: {missing} of {stats['frames']} frames are not localised ({100 * (1 - stats['success_rate']):.0f} %)"
 
 
 def _say_empty_meshes(names: list[str]) -> int:

@@ -1,19 +1,24 @@
 # SPDX-License-Identifier: Apache-2.0
 """What a source of pictures must offer, and the part that all sources made of picture files share."""
 
+from collections.abc import Iterator
 from dataclasses import dataclass
+from functools import cached_property
 from pathlib import Path
 from typing import Protocol
 
 import numpy as np
 
-from vitamin3d.datasets.pictures import Picture, Unreadable, read_picture
+from vitamin3d.datasets.pictures import DEEP_SUFFIXES, Picture, Unreadable, picture_of, read_picture, read_pixels
+from vitamin3d.datasets.sixteen_bits import FULL_RANGE, largest_shown, white_level
 from vitamin3d.errors import InputError
 from vitamin3d.geometry.camera import Camera
 from vitamin3d.types import Array, Frame, Trajectory
 
 SIZE_SAMPLES = 50
 """Pictures looked at before all of them are said to have the wrong size."""
+DEPTH_SAMPLES = 8
+"""Pictures spread over the sequence that say which part of 16 bits is in use."""
 
 
 class Dataset(Protocol):
@@ -28,6 +33,11 @@ class Dataset(Protocol):
     @property
     def timestamps_ns(self) -> Array:
         """(T,) int64, strictly ascending."""
+        ...
+
+    @property
+    def remarks(self) -> list[str]:
+        """What was done to the pictures that the user should know, a line each."""
         ...
 
     def __len__(self) -> int: ...
@@ -70,8 +80,29 @@ class PictureSequence:
         return self._paths[index]
 
     def read(self, index: int) -> Frame | Unreadable:
-        picture = read_picture(self._paths[index])
-        return picture if isinstance(picture, Unreadable) else frame_of(picture, index, self.timestamps_ns, self.camera, self._paths[index])
+        path = self._paths[index]
+        pixels = read_pixels(path)
+        if isinstance(pixels, Unreadable):
+            return pixels
+        picture = picture_of(pixels, self._white if pixels.dtype == np.uint16 else FULL_RANGE)
+        return frame_of(picture, index, self.timestamps_ns, self.camera, path)
+
+    @property
+    def remarks(self) -> list[str]:
+        return [] if self._white == FULL_RANGE else [f"16-bit pictures: values up to {largest_shown(self._white)} are shown as 8 bits"]
+
+    @cached_property
+    def _white(self) -> int:
+        """The white level of the sequence's 16-bit pictures: the files alone decide, whichever is read first."""
+        return white_level(self._deep_samples())
+
+    def _deep_samples(self) -> Iterator[Array]:
+        paths = [path for path in self._paths if path.suffix.lower() in DEEP_SUFFIXES]
+        size = self.camera.height, self.camera.width
+        for i in np.linspace(0, len(paths) - 1, min(DEPTH_SAMPLES, len(paths))).astype(int):
+            pixels = read_pixels(paths[i])
+            if not isinstance(pixels, Unreadable) and pixels.dtype == np.uint16 and pixels.shape[:2] == size:
+                yield pixels
 
     def ground_truth(self) -> Trajectory | None:
         return None

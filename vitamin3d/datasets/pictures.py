@@ -7,9 +7,12 @@ from pathlib import Path
 import cv2
 import numpy as np
 
+from vitamin3d.datasets.sixteen_bits import FULL_RANGE, eight_bits
 from vitamin3d.types import Array
 
 PICTURE_SUFFIXES = frozenset({".jpg", ".jpeg", ".png", ".bmp", ".tif", ".tiff", ".webp", ".pgm", ".ppm"})
+DEEP_SUFFIXES = frozenset({".png", ".tif", ".tiff", ".pgm", ".ppm"})
+"""Those that can hold 16 bits."""
 DECODE = cv2.IMREAD_ANYCOLOR | cv2.IMREAD_ANYDEPTH | cv2.IMREAD_IGNORE_ORIENTATION
 """The sensor's own grid: a rotation tag changes nothing, since the calibration belongs to the grid."""
 
@@ -34,6 +37,12 @@ class Unreadable:
 
 def read_picture(path: Path) -> Picture | Unreadable:
     """Decodes a picture file; 16-bit values are divided by 256, alpha is dropped."""
+    pixels = read_pixels(path)
+    return pixels if isinstance(pixels, Unreadable) else picture_of(pixels)
+
+
+def read_pixels(path: Path) -> Array | Unreadable:
+    """The values of a picture file, (H, W) or (H, W, 3) BGR, uint8 or uint16."""
     try:
         data = path.read_bytes()
     except FileNotFoundError:
@@ -47,16 +56,13 @@ def read_picture(path: Path) -> Picture | Unreadable:
     pixels = _decode(data)
     if pixels is None:
         return Unreadable(path, "the file is damaged or not a picture")
-    picture = picture_of(pixels)
-    return Unreadable(path, f"its pixels are {pixels.dtype}, not 8 or 16 bits") if picture is None else picture
+    return pixels if pixels.dtype in (np.uint8, np.uint16) else Unreadable(path, f"its pixels are {pixels.dtype}, not 8 or 16 bits")
 
 
-def picture_of(pixels: Array) -> Picture | None:
-    """Picture of pixels (H, W) or (H, W, 3) BGR, uint8 or uint16; None for other types."""
+def picture_of(pixels: Array, white: int = FULL_RANGE) -> Picture:
+    """Picture of pixels (H, W) or (H, W, 3) BGR, uint8, or uint16 of a sequence with this white level."""
     if pixels.dtype == np.uint16:
-        pixels = (pixels >> 8).astype(np.uint8)
-    if pixels.dtype != np.uint8:
-        return None
+        pixels = eight_bits(pixels, white)
     if pixels.ndim == 2:
         return Picture(pixels, None)
     if np.array_equal(pixels[..., 0], pixels[..., 1]) and np.array_equal(pixels[..., 1], pixels[..., 2]):

@@ -39,6 +39,10 @@ class VideoDataset:
     def __len__(self) -> int:
         return len(self.timestamps_ns)
 
+    @property
+    def remarks(self) -> list[str]:
+        return []
+
     def path_of(self, index: int) -> Path:
         return self._source
 

@@ -72,6 +72,8 @@ class Report:
     """As in `stats.json`."""
     stats: str = ""
     settings: str = ""
+    sections: Sequence[str] = ()
+    """HTML, before the view: `section_table`."""
 
 
 def report_html(report: Report) -> str:
@@ -104,6 +106,16 @@ def evaluation_section(table: str, plots: Sequence[str]) -> str:
     return f"<h2>Against the ground truth</h2><div class=strip>{''.join(plots)}</div>{figures}"
 
 
+def section_table(title: str, heads: Sequence[str], rows: Sequence[Sequence[object]]) -> str:
+    """A part of the page: a table of plain text."""
+    lines = [heads, *rows]
+    cells = "".join(
+        "<tr>" + "".join(f"<{kind}>{escape(str(cell))}</{kind}>" for cell in line) + "</tr>"
+        for line, kind in zip(lines, ["th", *["td"] * len(rows)], strict=True)
+    )
+    return f"<h2>{escape(title)}</h2><table>{cells}</table>"
+
+
 def _page(report: Report, triangles: int) -> str:
     surface = None if report.surface is None or not len(report.surface.triangles) else decimated(report.surface, triangles)
     rows = np.linspace(0, len(report.points) - 1, min(MAX_POINTS, len(report.points))).astype(int)
@@ -115,6 +127,7 @@ def _page(report: Report, triangles: int) -> str:
         f"<title>{escape(report.title)}</title><style>{STYLE}</style></head><body>",
         f"<h1>{escape(report.title)}</h1><div>{escape(report.subtitle)}</div>",
         f"<div class=cards>{''.join(f'<div class=card><b>{escape(v)}</b><span>{escape(k)}</span></div>' for v, k in report.cards)}</div>",
+        *report.sections,
         _view(report, surface, points),
         "<!--evaluation--><!--/evaluation-->",
         _strip("Tracked extrema", report.frames),

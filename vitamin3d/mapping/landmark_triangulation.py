@@ -3,12 +3,27 @@
 
 import numpy as np
 
+from vitamin3d._jit import kernel
 from vitamin3d.config import TriangulationConfig
 from vitamin3d.geometry.camera import Camera
+from vitamin3d.geometry.reprojection import squared_error
 from vitamin3d.geometry.se3 import inverse
 from vitamin3d.geometry.triangulation import triangulate
 from vitamin3d.mapping.sparse_map import SparseMap
 from vitamin3d.types import Array
+
+
+@kernel
+def _squared_errors(  # type: ignore[no-untyped-def]
+    intrinsics, R, t, starts, oldest, obs_landmark, obs_valid, obs_pixels, first, points, wanted, squared, count
+):
+    """Adds the squared errors of the observations, from the `oldest` keyframe on, of tracks at their numbers in `wanted`."""
+    for k in range(oldest, R.shape[0]):
+        for i in range(starts[k], starts[k + 1]):
+            at = wanted[obs_landmark[i]]
+            if at >= 0 and obs_valid[i] and i >= first[at]:
+                squared[at] += squared_error(intrinsics, R[k], t[k], points[at], obs_pixels[i])
+                count[at] += 1
 
 
 def triangulate_landmarks(sparse_map: SparseMap, camera: Camera, config: TriangulationConfig) -> int:
@@ -27,8 +42,26 @@ def triangulate_landmarks(sparse_map: SparseMap, camera: Camera, config: Triangu
     pending[pending] &= sparse_map.num_observations[ids[pending]] >= config.min_observations
     rows, ids, first = rows[pending], ids[pending], first[pending]
     points, good = _two_ray_points(sparse_map, first, rows, camera, config)
+    rows, ids, first, points = rows[good], ids[good], first[good], points[good]
+    good = _agrees_between(sparse_map, ids, first, points, camera, config)
     sparse_map.points_world[ids[good]] = points[good]
     return int(good.sum())
+
+
+def _agrees_between(sparse_map: SparseMap, ids: Array, first: Array, points: Array, camera: Camera, config: TriangulationConfig) -> Array:
+    """(N,) bool: points whose observations between the first and the newest agree with them too: what slides or steps does not."""
+    if len(ids) == 0 or config.max_rms_px == 0.0:
+        return np.ones(len(ids), np.bool_)
+    wanted = np.full(len(sparse_map.points_world), -1, np.int64)
+    wanted[ids] = np.arange(len(ids))
+    squared, count, poses = np.zeros(len(ids)), np.zeros(len(ids), np.int64), sparse_map.T_cam_world
+    oldest = max(int(sparse_map.keyframe_of(first).min()), sparse_map.num_keyframes - config.checked_keyframes)
+    R, t = np.ascontiguousarray(poses[:, :3, :3]), np.ascontiguousarray(poses[:, :3, 3])
+    _squared_errors(
+        camera.intrinsics, R, t, np.array(sparse_map.keyframe_starts), oldest, sparse_map.obs_landmark, sparse_map.obs_valid,
+        sparse_map.obs_pixels, first, points, wanted, squared, count,
+    )  # fmt: skip
+    return np.asarray(np.sqrt(squared / np.maximum(count, 1)) <= config.max_rms_px)
 
 
 def _two_ray_points(sparse_map: SparseMap, first: Array, newest: Array, camera: Camera, config: TriangulationConfig) -> tuple[Array, Array]:

@@ -39,6 +39,10 @@ class PoseLog:
         row = self._row_of_frame[frame_index]
         return np.asarray(self._T_cam_keyframe.view[row] @ sparse_map.T_cam_world[self._keyframes.view[row]])
 
+    def newest(self, sparse_map: SparseMap) -> Array:
+        """T_cam_world (4, 4) of the frame logged last."""
+        return self.pose(self._last[-1], sparse_map)
+
     def predict(self, sparse_map: SparseMap) -> Array:
         """T_cam_world (4, 4) of the next frame, moving on as between the last two."""
         newest = self.pose(self._last[-1], sparse_map)

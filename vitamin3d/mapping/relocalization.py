@@ -6,6 +6,7 @@ keyframe's corner that lies on a landmark's observation lends it that landmark, 
 """
 
 from collections.abc import Iterable
+from dataclasses import replace
 
 import cv2
 import numpy as np
@@ -29,40 +30,92 @@ def described_corners(image: Array, count: int) -> tuple[Array, Array]:
     return np.array([k.pt for k in keypoints], np.float64), descriptors
 
 
+class RememberedKeyframes:
+    """Pictures of keyframes in which the camera may be found again: the newest, and every so many-th of those before; described once."""
+
+    def __init__(self, config: RelocalizationConfig) -> None:
+        self.config = config
+        self._pictures: dict[int, Frame] = {}
+        self._corners: dict[int, tuple[Array, Array]] = {}
+
+    def add(self, keyframe: int, frame: Frame) -> None:
+        """Remembers a new keyframe; of the older ones every `stride`-th stays, the oldest leave."""
+        self._pictures[keyframe] = replace(frame, color=None)
+        passing = keyframe - self.config.keyframes
+        if passing % self.config.stride:
+            self._forget(passing)
+        if len(self._pictures) > self.config.max_remembered:
+            self._forget(min(self._pictures))
+
+    def _forget(self, keyframe: int) -> None:
+        self._pictures.pop(keyframe, None)
+        self._corners.pop(keyframe, None)
+
+    def move_to(self, kept_keyframes: Array) -> None:
+        """Keyframes are numbered anew; `kept_keyframes` (K',) are the old numbers of those that stay."""
+        new = {int(old): k for k, old in enumerate(kept_keyframes)}
+        self._pictures = {new[k]: picture for k, picture in self._pictures.items() if k in new}
+        self._corners = {new[k]: corners for k, corners in self._corners.items() if k in new}
+
+    def to_try(self, num_lost: int) -> list[tuple[int, tuple[Array, Array]]]:
+        """Keyframes and their described corners: the newest first, others in turn the longer the camera is lost."""
+        newest_first, count = sorted(self._pictures, reverse=True), self.config.keyframes
+        chosen = newest_first[:count]
+        if num_lost >= self.config.tries_at_once:
+            others = newest_first[count:] or chosen
+            begin = (num_lost // self.config.interval * (count - 1)) % len(others)
+            chosen = newest_first[:1] + (others + others)[begin : begin + count - 1]
+        return [(k, self._described(k)) for k in dict.fromkeys(chosen)]
+
+    def _described(self, keyframe: int) -> tuple[Array, Array]:
+        if keyframe not in self._corners:
+            self._corners[keyframe] = described_corners(self._pictures[keyframe].image, self.config.corners)
+        return self._corners[keyframe]
+
+
 def landmark_matches(
-    corners: tuple[Array, Array], keyframe: int, picture: Array, sparse_map: SparseMap, camera: Camera, config: RelocalizationConfig
-) -> tuple[Array, Array]:
+    corners: tuple[Array, Array], keyframe: int, described: tuple[Array, Array], sparse_map: SparseMap, camera: Camera,
+    config: RelocalizationConfig,
+) -> tuple[Array, Array]:  # fmt: skip
     """Landmarks (N,) ids of a keyframe and rows (N,) of the frame's corners that match them.
 
     Args:
         corners: of the frame, from `described_corners`.
-        picture: (H, W) uint8 of the keyframe.
+        described: the same of the keyframe.
     """
-    pixels, descriptors = described_corners(picture, config.corners)
+    none = np.zeros(0, np.int64), np.zeros(0, np.int64)
+    pixels, descriptors = described
     rows = sparse_map.observations_of(keyframe)
     ids = sparse_map.obs_landmark[rows]
     usable = sparse_map.obs_valid[rows] & sparse_map.is_mapped(ids)
     if len(pixels) == 0 or len(corners[0]) == 0 or not usable.any():
-        return np.zeros(0, np.int64), np.zeros(0, np.int64)
+        return none
     distances, nearest = cKDTree(sparse_map.obs_pixels[rows][usable]).query(np.nan_to_num(camera.undistort(pixels), nan=-1e6))
-    matches = cv2.BFMatcher(cv2.NORM_HAMMING, crossCheck=True).match(descriptors, corners[1])
+    lent = np.flatnonzero(distances < config.max_distance_px)
+    if len(lent) == 0:
+        return none
+    matches = cv2.BFMatcher(cv2.NORM_HAMMING, crossCheck=True).match(descriptors[lent], corners[1])
     pairs = np.array([(m.queryIdx, m.trainIdx) for m in matches], np.int64).reshape(-1, 2)
-    pairs = pairs[distances[pairs[:, 0]] < config.max_distance_px]
-    return ids[usable][nearest[pairs[:, 0]]], pairs[:, 1]
+    return ids[usable][nearest[lent[pairs[:, 0]]]], pairs[:, 1]
 
 
 def relocalize(
     frame: Frame,
-    keyframes: Iterable[tuple[int, Frame]],
+    keyframes: Iterable[tuple[int, tuple[Array, Array]]],
     sparse_map: SparseMap,
     camera: Camera,
     config: RelocalizationConfig,
     localization: LocalizationConfig,
 ) -> Localization:
-    """Pose of a frame from nothing but the map and the pictures of some keyframes; `converged` False where it is not found."""
+    """Pose of a frame from nothing but the map and the described corners of some keyframes; `converged` False where it is not found."""
     corners = described_corners(frame.image, config.corners)
-    found = [landmark_matches(corners, k, picture.image, sparse_map, camera, config) for k, picture in keyframes]
+    found = [landmark_matches(corners, k, described, sparse_map, camera, config) for k, described in keyframes]
     ids = np.concatenate([np.zeros(0, np.int64), *(pair[0] for pair in found)])
     pixels = camera.undistort(np.concatenate([np.zeros((0, 2)), *(corners[0][pair[1]] for pair in found)]))
     valid = np.isfinite(pixels[:, 0])
     return localize(sparse_map.points_world[ids[valid]], pixels[valid], None, camera, localization, frame.index)
+
+
+def is_search_due(num_lost: int, config: RelocalizationConfig) -> bool:
+    """Whether the search is worth its time in the so many-th frame in a row that is lost (from 0): at once, then now and then."""
+    return num_lost < config.tries_at_once or num_lost % config.interval == 0

@@ -1,0 +1,98 @@
+# SPDX-License-Identifier: Apache-2.0
+"""A camera that turns without travelling, followed by what has no depth: no landmark comes from it, and no length.
+
+A track is known by its direction in the world, taken when it was first seen; the directions of a frame's tracks determine its rotation.
+Where the camera travels they show parallax, disagree, and nothing is claimed.
+"""
+
+from dataclasses import replace
+
+import numpy as np
+
+from vitamin3d.config import RotationConfig
+from vitamin3d.geometry.camera import Camera
+from vitamin3d.mapping.sparse_map import GrowingArray
+from vitamin3d.types import Array, Frame
+
+INLIER_SIGMAS = 3.0
+ITERATIONS = 12
+
+
+class Directions:
+    """By track id: the direction in the world in which a track was first seen; NaN where it is not known."""
+
+    def __init__(self) -> None:
+        self._directions = GrowingArray((3,), np.float64, np.nan)
+
+    def note(self, ids: Array, pixels: Array, R_cam_world: Array, camera: Camera) -> None:
+        """Tracks (N,) ids at ideal pixels (N, 2) that have no direction get the one in which this camera sees them."""
+        self._directions.resize(int(ids.max(initial=-1)) + 1)
+        new = np.isnan(self._directions.view[ids, 0])
+        self._directions.view[ids[new]] = unit_rays(pixels[new], camera) @ R_cam_world
+
+    def of(self, ids: Array) -> Array:
+        """Unit directions (N, 3) in the world of tracks (N,) ids."""
+        out, known = np.full((len(ids), 3), np.nan), ids < self._directions.size
+        out[known] = self._directions.view[ids[known]]
+        return out
+
+    def renamed(self, kept_ids: Array) -> "Directions":
+        """With ids numbered anew: the new id is the position in `kept_ids`."""
+        renamed = Directions()
+        renamed._directions.append(self.of(kept_ids))
+        return renamed
+
+
+class Turns:
+    """A chain of frames in which the camera did no more than turn, with their rotations from the first."""
+
+    def __init__(self) -> None:
+        self._frames: list[tuple[Frame, Array]] = []
+
+    @property
+    def newest(self) -> Array:
+        """R_cam_world (3, 3) of the newest frame, the world being the first's; the identity where there is none."""
+        return self._frames[-1][1] if self._frames else np.eye(3)
+
+    def add(self, frame: Frame, R_cam_world: Array) -> None:
+        self._frames.append((replace(frame, image=frame.image[:0], color=None), R_cam_world))
+
+    def has_turned(self, config: RotationConfig) -> bool:
+        """Whether the camera has turned by more than a hand's shake, in more than a few frames."""
+        angle = np.degrees(np.arccos(np.clip(0.5 * (np.trace(self.newest) - 1.0), -1.0, 1.0)))
+        return bool(self._frames and angle > config.min_turn_deg)
+
+    def since(self, reference: int) -> list[tuple[Frame, Array]]:
+        """The frames of the chain with T_cam_reference (4, 4), all at one place; none where the reference frame is not in it."""
+        R_reference = next((R for frame, R in self._frames if frame.index == reference), None)
+        if R_reference is None:
+            return []
+        poses = np.tile(np.eye(4), (len(self._frames), 1, 1))
+        poses[:, :3, :3] = np.stack([R @ R_reference.T for _, R in self._frames])
+        return [(frame, T) for (frame, _), T in zip(self._frames, poses, strict=True)]
+
+
+def unit_rays(pixels: Array, camera: Camera) -> Array:
+    """Unit directions (N, 3) in the camera of ideal pixels (N, 2)."""
+    rays = camera.rays_from_ideal(pixels)
+    return np.asarray(rays / np.linalg.norm(rays, axis=1, keepdims=True))
+
+
+def rotation_of(directions: Array, pixels: Array, R_before: Array, camera: Camera, config: RotationConfig) -> Array | None:
+    """R_cam_world (3, 3) that turns directions (N, 3) in the world to ideal pixels (N, 2); None where too few agree on one.
+
+    Weighted Kabsch with Geman–McClure weights, the scale annealed from what the rotation before leaves to that of the settings.
+    """
+    known = np.isfinite(directions[:, 0])
+    directions, rays = directions[known], unit_rays(pixels[known], camera)
+    if len(rays) < config.min_tracks or not config.enabled:
+        return None
+    sigma, scale, R = config.sigma_px / camera.fx, np.inf, R_before
+    for _ in range(ITERATIONS):
+        squared = ((directions @ R.T - rays) ** 2).sum(axis=1)
+        scale = max(sigma, min(0.6 * scale, 1.5 * float(np.sqrt(np.median(squared)))))
+        weights = (scale**2 / (squared + scale**2)) ** 2
+        U, _, Vt = np.linalg.svd((rays * weights[:, None]).T @ directions)
+        R = U @ np.diag([1.0, 1.0, np.linalg.det(U @ Vt)]) @ Vt
+    agrees = ((directions @ R.T - rays) ** 2).sum(axis=1) < (INLIER_SIGMAS * sigma) ** 2
+    return np.asarray(R) if agrees.sum() >= max(config.min_tracks, config.min_share * len(rays)) else None
