@@ -25,10 +25,10 @@ class Atlas:
         self._born = 0
         self.left: list[Slam] = []
         """Maps in which the camera was lost and that another one followed."""
-        self.active = self._new_map()
-        """The map in which the camera is tracked, or was last."""
         self.successor: Slam | None = None
         """The next one, while the camera is lost in the active one."""
+        self.active = self._new_map()
+        """The map in which the camera is tracked, or was last."""
 
     @property
     def current(self) -> Slam:
@@ -43,7 +43,8 @@ class Atlas:
 
     def _tracked(self, front: FrontEndFrame) -> SlamState:
         state = self.active.process_frame(front)
-        if state not in (SlamState.LOST, SlamState.ROTATING):
+        is_held = state not in (SlamState.LOST, SlamState.ROTATING)
+        if is_held or self.active.map.num_keyframes == 0:
             self.successor = None
             return state
         self.active.take_adjustment(wait=True)  # both maps may have one adjuster, and it does one thing at a time
@@ -61,12 +62,16 @@ class Atlas:
             self.successor = self._new_map()
             return self.successor.process_frame(front)
         if state is SlamState.TRACKING and not self._is_young(self.successor):
+            self.active.leave_turns_to(self.successor)
             self.left.append(self.active)
             self.active, self.successor = self.successor, None
         return state
 
     def _new_map(self) -> Slam:
         slam = Slam(self.camera, self.config, self._born, self.times)
+        older = [other for other in self._all() if not self._is_young(other)] if self._born else []
+        if older:
+            slam.inherit(max(older, key=lambda other: len(other.poses)))
         slam.adjuster = self.adjuster
         self._born += 1
         return slam

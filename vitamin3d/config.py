@@ -190,9 +190,15 @@ class RotationConfig:
     enabled: bool = True
     min_tracks: int = 50
     """That agree on the rotation;"""
-    min_share: float = 0.6
-    """and this share of all: parallax disagrees."""
-    sigma_px: float = 1.5
+    min_share: float = 0.4
+    """and this share of all: parallax disagrees;"""
+    min_old_share: float = 0.95
+    """and of the older half of the tracks this many times as large a share,"""
+    max_doubts: int = 3
+    """except in so many frames in a row; so many tries to initialise in a row must show parallax as well."""
+    sigma_px: float = 1.0
+    max_parallax_deg: float = 0.2
+    """Median, of a try to initialise; above it the camera has travelled."""
     min_turn_deg: float = 5.0
     """Of a camera without a map that is said to turn."""
 

@@ -61,8 +61,9 @@ class Slam:
         self._past = WindowPrior(config)
         self._history = InitializationHistory(config.initialization)
         self._pending_frames: dict[int, Frame] = {}
-        self._directions, self._turns = Directions(), Turns()
+        self._directions, self._turns, self._num_doubts = Directions(), Turns(), 0
         self._remembered = RememberedKeyframes(config.relocalization)
+        self._turned_frames: list[int] = []
         self.num_lost = 0
         """Frames in a row in which the camera was not found, less one."""
         self._meetings: list[Array] = []
@@ -76,6 +77,11 @@ class Slam:
         self._unique_ids, self._num_condensed, self._num_forgotten = np.zeros(0, np.int64), 0, 0
         self._frame_count = 0
         self._newest_frame = -1
+
+    def inherit(self, other: "Slam") -> None:
+        """Begins with the camera as another map of the recording has refined it."""
+        self.camera = other.camera
+        self.calibration.inherit(other.calibration)
 
     def process_frame(self, front: FrontEndFrame) -> SlamState:
         """One frame, from its curvature and flow to an adjusted map."""
@@ -177,6 +183,7 @@ class Slam:
         if not self._history.is_worth_a_try(pixels_0, pixels_1):
             return
         attempt = initialize_from_two_views(pixels_0, pixels_1, self.camera, self.config.initialization)
+        self._turns.judge(attempt.parallax_deg, self._history.reference_index, self.config.rotation)
         first = build_first_map(attempt.view, ids, self._history.since_reference(), self.camera, self.config) if attempt.view else None
         if first is None:
             self.initialization_reason = attempt.reason or "the first map did not survive its bundle adjustment"
@@ -193,8 +200,9 @@ class Slam:
     def _turn_on(self, frame: Frame) -> None:
         """Before there is a map: the rotation since the chain of frames began in which the camera did no more than turn."""
         seen, pixels = self._seen()
-        R = rotation_of(self._directions.of(seen.ids), pixels, self._turns.newest, self.camera, self.config.rotation)
-        if R is None:
+        turn = rotation_of(self._directions.of(seen.ids), pixels, seen.ages, self._turns.newest, self.camera, self.config.rotation)
+        R = np.eye(3) if turn is None else turn.R_cam_world
+        if turn is None or self._turns.ended_before(self._history.reference_index):
             self._turns, self._directions, R = Turns(), Directions(), np.eye(3)
         self._turns.add(frame, R)
         self._directions.note(seen.ids, pixels, R, self.camera)
@@ -203,8 +211,8 @@ class Slam:
 
     def _log_history(self) -> None:
         """Localises the frames from before the map against it: their tracks were kept."""
-        for frame, R in self._turns.since(self.map.frame_indices[0]):
-            self.poses.add(frame, 0, R)
+        for frame, T_cam_reference in self._turns.since(self.map.frame_indices[0]) if self.number == 0 else []:
+            self.poses.add(frame, 0, T_cam_reference)
         keyframe_of_frame = {index: k for k, index in enumerate(self.map.frame_indices)}
         for view in self._history.views:
             k = keyframe_of_frame.get(view.frame.index)
@@ -226,6 +234,7 @@ class Slam:
         if not found.converged or found.is_inlier.sum() < self.config.localization.min_kept_ratio * self.map.is_mapped(self.tracks.ids).sum():
             return self._rotate(front, seen, pixels)
         self.state = SlamState.TRACKING
+        self._turned_frames.clear()
         self._end_tracks(ids[~found.is_inlier])
         recovery = self.config.recovery
         if recovery.enabled and self._frame_count % recovery.interval == 0 and self._recover(front, found.T_cam_world):
@@ -237,24 +246,28 @@ class Slam:
 
         Returns the pose of the latter: nothing is added to the map by a turn.
         """
-        T_cam_world = None
-        if self.config.rotation.enabled and self.state is not SlamState.LOST:
-            T_cam_world = self._turned(seen, pixels, self.poses.newest(self.map))
-        if T_cam_world is None:
+        before = self.poses.newest(self.map)
+        R = None if self.state is SlamState.LOST else self._turned(seen, pixels, before[:3, :3])
+        if R is None:
             return self._find_camera(front)
         self.state = SlamState.ROTATING
+        T_cam_world = np.eye(4)
+        T_cam_world[:3, :3], T_cam_world[:3, 3] = R, R @ before[:3, :3].T @ before[:3, 3]
         self.poses.add_world(front.frame, T_cam_world, self.map)
-        self._directions.note(seen.ids, pixels, T_cam_world[:3, :3], self.camera)
+        self._turned_frames.append(front.frame.index)
+        self._directions.note(seen.ids, pixels, R, self.camera)
         return None
 
-    def _turned(self, seen: Tracks, pixels: Array, T_before: Array) -> Array | None:
-        """T_cam_world of a camera that turned on the spot."""
-        R = rotation_of(self._directions.of(seen.ids), pixels, T_before[:3, :3], self.camera, self.config.rotation)
-        if R is None:
-            return None
-        T = np.eye(4)
-        T[:3, :3], T[:3, 3] = R, R @ T_before[:3, :3].T @ T_before[:3, 3]
-        return T
+    def leave_turns_to(self, other: "Slam") -> None:
+        """Frames of a turn that no landmark ended are those of the map that followed, where it has them."""
+        self.poses.forget([index for index in self._turned_frames if index in other.poses])
+
+    def _turned(self, seen: Tracks, pixels: Array, R_before: Array) -> Array | None:
+        """R_cam_world of a camera that turned on the spot; None where it did not, or seems to travel for a few frames."""
+        directions = self._directions.of(seen.ids)
+        turn = rotation_of(directions, pixels, seen.ages, R_before, self.camera, self.config.rotation)
+        self._num_doubts = self._num_doubts + 1 if turn is not None and turn.is_doubtful else 0
+        return None if turn is None or self._num_doubts > self.config.rotation.max_doubts else turn.R_cam_world
 
     def _pose_of_votes(self, ids: Array, pixels: Array, T_prior: Array, seed: int = 0) -> Localization:
         """The pose by landmarks (N,) ids at ideal pixels (N, 2), those with many observations deciding."""

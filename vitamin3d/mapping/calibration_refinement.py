@@ -60,6 +60,10 @@ class CalibrationRefinement:
         """Whether keyframes need the image's motion, from which the readout time comes; not once it is known to be none."""
         return self.is_enabled and self.config.readout and not self._reads_at_once
 
+    def inherit(self, other: "CalibrationRefinement") -> None:
+        """Knows what another map of the same camera found out about its shutter."""
+        self._reads_at_once = other._reads_at_once
+
     def is_due(self, num_keyframes: int) -> bool:
         """Whether the map has grown enough since the last refinement."""
         return self.is_enabled and num_keyframes >= max(self.config.first_keyframes, self._next)

@@ -42,6 +42,11 @@ class InitializationHistory:
     def reference(self) -> TrackedView:
         return self.views[self._reference]
 
+    @property
+    def reference_index(self) -> int:
+        """Of the reference's frame; -1 where there is none."""
+        return self.reference.frame.index if self.views else -1
+
     def since_reference(self) -> list[TrackedView]:
         return self.views[self._reference :]
 

@@ -1,6 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
 """The poses of all localised frames, each kept relative to a keyframe, so that later adjustments move it along."""
 
+from collections.abc import Iterable
+
 import numpy as np
 
 from vitamin3d.geometry.se3 import inverse
@@ -22,7 +24,7 @@ class PoseLog:
 
     def add(self, frame: Frame, keyframe: int, T_cam_keyframe: Array) -> None:
         """Logs a frame by its pose relative to a keyframe (the identity for the keyframe itself)."""
-        row = self._row_of_frame.setdefault(frame.index, len(self._row_of_frame))
+        row = self._row_of_frame.setdefault(frame.index, self._frames.size)
         values = ((self._frames, frame.index), (self._stamps, frame.timestamp_ns), (self._keyframes, keyframe))
         for array, value in (*values, (self._T_cam_keyframe, T_cam_keyframe)):
             array.resize(row + 1)
@@ -33,6 +35,14 @@ class PoseLog:
         """Logs a frame by its pose (4, 4), relative to the newest keyframe that is not younger."""
         keyframe = max(0, int(np.searchsorted(sparse_map.frame_indices, frame.index, side="right")) - 1)
         self.add(frame, keyframe, T_cam_world @ inverse(sparse_map.T_cam_world[keyframe]))
+
+    def __contains__(self, frame_index: object) -> bool:
+        return frame_index in self._row_of_frame
+
+    def forget(self, frame_indices: Iterable[int]) -> None:
+        """Takes frames out of the log."""
+        for index in frame_indices:
+            self._frames.view[self._row_of_frame.pop(index)] = -1
 
     def pose(self, frame_index: int, sparse_map: SparseMap) -> Array:
         """T_cam_world (4, 4) of a logged frame as the map stands now."""
@@ -67,6 +77,6 @@ class PoseLog:
 
     def trajectory(self, sparse_map: SparseMap) -> Trajectory:
         """Camera-to-world poses of all logged frames, by time."""
-        order = np.argsort(self._frames.view)
+        order = np.argsort(self._frames.view)[(self._frames.view < 0).sum() :]
         poses = self._T_cam_keyframe.view[order] @ sparse_map.T_cam_world[self._keyframes.view[order]]
         return Trajectory(self._stamps.view[order], inverse(poses))

@@ -5,7 +5,7 @@ A track is known by its direction in the world, taken when it was first seen; th
 Where the camera travels they show parallax, disagree, and nothing is claimed.
 """
 
-from dataclasses import replace
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -48,19 +48,32 @@ class Turns:
 
     def __init__(self) -> None:
         self._frames: list[tuple[Frame, Array]] = []
+        self._is_ended, self._newest, self._num_doubts = False, np.eye(3), 0
+
+    def judge(self, parallax_deg: float, reference: int, config: RotationConfig) -> None:
+        """Ends the chain at the reference of tries to initialise (a frame's index) that show parallax several times in a row."""
+        self._num_doubts = self._num_doubts + 1 if parallax_deg > config.max_parallax_deg else 0
+        if self._num_doubts >= config.max_doubts:
+            self._frames, self._is_ended = [pair for pair in self._frames if pair[0].index <= reference], True
+
+    def ended_before(self, reference: int) -> bool:
+        """Whether the chain has ended at a frame from which no map will begin any more."""
+        return self._is_ended and (not self._frames or self._frames[-1][0].index < reference)
 
     @property
     def newest(self) -> Array:
         """R_cam_world (3, 3) of the newest frame, the world being the first's; the identity where there is none."""
-        return self._frames[-1][1] if self._frames else np.eye(3)
+        return self._newest
 
     def add(self, frame: Frame, R_cam_world: Array) -> None:
-        self._frames.append((replace(frame, image=frame.image[:0], color=None), R_cam_world))
+        self._newest = R_cam_world
+        if not self._is_ended:
+            self._frames.append((replace(frame, image=frame.image[:0], color=None), R_cam_world))
 
     def has_turned(self, config: RotationConfig) -> bool:
         """Whether the camera has turned by more than a hand's shake, in more than a few frames."""
         angle = np.degrees(np.arccos(np.clip(0.5 * (np.trace(self.newest) - 1.0), -1.0, 1.0)))
-        return bool(self._frames and angle > config.min_turn_deg)
+        return bool(not self._is_ended and angle > config.min_turn_deg)
 
     def since(self, reference: int) -> list[tuple[Frame, Array]]:
         """The frames of the chain with T_cam_reference (4, 4), all at one place; none where the reference frame is not in it."""
@@ -78,13 +91,24 @@ def unit_rays(pixels: Array, camera: Camera) -> Array:
     return np.asarray(rays / np.linalg.norm(rays, axis=1, keepdims=True))
 
 
-def rotation_of(directions: Array, pixels: Array, R_before: Array, camera: Camera, config: RotationConfig) -> Array | None:
+@dataclass(frozen=True)
+class Turn:
+    """A rotation between frames."""
+
+    R_cam_world: Array
+    """(3, 3)."""
+    is_doubtful: bool
+    """Older tracks agree with it less often: the camera may be travelling."""
+
+
+def rotation_of(directions: Array, pixels: Array, ages: Array, R_before: Array, camera: Camera, config: RotationConfig) -> Turn | None:
     """R_cam_world (3, 3) that turns directions (N, 3) in the world to ideal pixels (N, 2); None where too few agree on one.
 
+    The older half of the tracks, by their ages (N,), shows parallax first.
     Weighted Kabsch with Geman–McClure weights, the scale annealed from what the rotation before leaves to that of the settings.
     """
     known = np.isfinite(directions[:, 0])
-    directions, rays = directions[known], unit_rays(pixels[known], camera)
+    directions, rays, ages = directions[known], unit_rays(pixels[known], camera), ages[known]
     if len(rays) < config.min_tracks or not config.enabled:
         return None
     sigma, scale, R = config.sigma_px / camera.fx, np.inf, R_before
@@ -95,4 +119,6 @@ def rotation_of(directions: Array, pixels: Array, R_before: Array, camera: Camer
         U, _, Vt = np.linalg.svd((rays * weights[:, None]).T @ directions)
         R = U @ np.diag([1.0, 1.0, np.linalg.det(U @ Vt)]) @ Vt
     agrees = ((directions @ R.T - rays) ** 2).sum(axis=1) < (INLIER_SIGMAS * sigma) ** 2
-    return np.asarray(R) if agrees.sum() >= max(config.min_tracks, config.min_share * len(rays)) else None
+    is_old = ages >= np.median(ages)
+    enough = agrees.sum() >= config.min_tracks and agrees.mean() >= config.min_share
+    return Turn(np.asarray(R), bool(agrees[is_old].mean() < config.min_old_share * agrees.mean())) if enough else None

@@ -21,6 +21,8 @@ class InitializationAttempt:
     view: TwoView | None
     reason: str
     """Empty on success; else a phrase for the user."""
+    parallax_deg: float = 0.0
+    """Median, where it was measured."""
     is_retry: bool = False
     """There was motion and parallax enough for a map, and none came of it; to wait for parallax is no retry."""
 
@@ -43,7 +45,7 @@ def initialize_from_two_views(pixels_0: Array, pixels_1: Array, camera: Camera, 
         return InitializationAttempt(None, f"no parallax: the picture moved by {motion:.1f} px, {config.min_motion_px:.0f} px are needed")
     view = relative_pose(pixels_0, pixels_1, camera, config.ransac_threshold_px)
     if view is None:
-        return InitializationAttempt(None, "no essential matrix explains the motion", True)
+        return InitializationAttempt(None, "no essential matrix explains the motion", is_retry=True)
     return _judged(view, config)
 
 
@@ -53,11 +55,11 @@ def _judged(view: TwoView, config: InitializationConfig) -> InitializationAttemp
     good = np.isfinite(view.points_0[:, 0])
     if inlier_ratio < config.min_inlier_ratio:
         reason = f"the motion is not that of a rigid scene: only {100 * inlier_ratio:.0f} % of the tracks agree"
-        return InitializationAttempt(None, reason, True)
+        return InitializationAttempt(None, reason, is_retry=True)
     parallax = float(np.median(view.parallax_deg[view.is_inlier]))
     if parallax < config.min_parallax_deg:
-        return InitializationAttempt(None, f"no parallax: {parallax:.2f}° in the median, the camera turns but does not travel")
+        return InitializationAttempt(None, f"no parallax: {parallax:.2f}° in the median, the camera turns but does not travel", parallax)
     if good.sum() < max(config.min_tracks, config.min_triangulated_ratio * view.is_inlier.sum()):
         reason = f"only {int(good.sum())} of {int(view.is_inlier.sum())} tracks lie in front of both cameras"
-        return InitializationAttempt(None, reason, True)
+        return InitializationAttempt(None, reason, is_retry=True)
     return InitializationAttempt(view, "")
