@@ -146,12 +146,14 @@ def climb(kappa, start, predicted, weight, sigma, max_steps):
     return None
 
 
-def climbed(kappa, predicted, weight, sigma, max_steps, gate):
-    """Sub-pixel position (2,) of the positive maximum within the gate; None where there is none."""
+def climbed(kappa, predicted, weight, sigma, max_steps, gate, min_roundness=0.0):
+    """Sub-pixel position (2,) of the positive maximum, round enough, within the gate; None where there is none."""
     end = climb(kappa, (int(np.rint(predicted[0])), int(np.rint(predicted[1]))), predicted, weight, sigma, max_steps)
     if end is None or kappa[end[1], end[0]] <= 0:
         return None
     u, v = end
+    if min_roundness > 0 and not roundness(kappa, u, v) >= min_roundness:
+        return None
     k = kappa.astype(np.float64)
     found = np.array([u + parabola_maximum(*k[v, u - 1 : u + 2]), v + parabola_maximum(*k[v - 1 : v + 2, u])])
     return found if np.linalg.norm(found - predicted) <= gate else None

@@ -13,6 +13,7 @@ from vitamin3d.mapping.window_adjustment import AdjustAtOnce, Adjuster
 from vitamin3d.slam import Slam
 from vitamin3d.types import Frame, FrameNote, FrontEndFrame, SlamState, StepTimes
 
+
 class Atlas:
     """Never gives up: tracks a sequence through as many maps as it takes."""
 

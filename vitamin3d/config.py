@@ -55,6 +55,13 @@ class CurvatureConfig:
     """Sec. 2.1, Eq. 1."""
 
     smoothing_sigma_px: float = 1.9
+    """Of the Gaussian blur before the derivatives;"""
+    max_smoothing_sigma_px: float = 2.8
+    """where the picture is noisy it widens up to this,"""
+    smoothing_per_noise: float = 0.3
+    """by so many pixels per grey level of noise above"""
+    quiet_noise: float = 2.0
+    """grey levels (standard deviation)."""
 
 
 @dataclass(frozen=True)
@@ -181,6 +188,12 @@ class LocalizationConfig:
     along an edge look like parallax, and are soon many."""
     min_voters: int = 60
     """With fewer of them landmarks with half the observations vote too, then with a quarter, then all."""
+    loose_observations: int = 4
+    """A pose is uncertain where fewer landmarks with so many observations"""
+    min_known: int = 10
+    """than this agree on it: nothing is added to the map then;"""
+    max_loose_frames: int = 10
+    """after so many such frames in a row the camera counts as lost."""
 
 
 @dataclass(frozen=True)
@@ -658,9 +671,11 @@ def paper_config() -> Config:
     """The literal paper: affine prediction (Eq. 4), no anchors, nothing found again, subspace Gauss–Newton alone."""
     return Config(
         mode="paper",
-        curvature=CurvatureConfig(smoothing_sigma_px=2.5),
+        curvature=CurvatureConfig(smoothing_sigma_px=2.5, max_smoothing_sigma_px=2.5),
         extrema=ExtremaConfig(min_roundness=0.0, wanted=0),
-        extrema_tracking=ExtremaTrackingConfig(prediction="dominant_flow", gate_px=8.0, gate_medians=0.0, min_roundness=0.0, coast_frames=0),
+        extrema_tracking=ExtremaTrackingConfig(
+            prediction="dominant_flow", gate_px=8.0, gate_medians=0.0, min_roundness=0.0, coast_frames=0
+        ),
         continuity=ContinuityConfig(enabled=False),
         localization=LocalizationConfig(prior_inlier_ratio=2.0, outlier_medians=100.0, votes=0),
         triangulation=TriangulationConfig(max_rms_px=0.0),

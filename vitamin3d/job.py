@@ -16,6 +16,7 @@ from vitamin3d.errors import InputError
 from vitamin3d.exporters.output_folder import MapFolder, OutputFolder
 from vitamin3d.map_output import MapOutput, MapOutputs
 from vitamin3d.mapping.landmark_statistics import information_by_id
+from vitamin3d.run_gaps import Gap, find_gaps, gaps_table, no_map_sentence
 from vitamin3d.run_report import write_report
 from vitamin3d.run_statistics import Stopwatch, live_table, map_table, run_statistics
 from vitamin3d.runtime import Observer, RunRecord, run_live, run_sequential, run_threaded
@@ -72,6 +73,8 @@ class Outcome:
     scale: Scale
     """Of the largest map."""
     stats: dict[str, Any]
+    gaps: list[Gap]
+    """Stretches of frames that no map has."""
 
     @property
     def has_map(self) -> bool:
@@ -227,12 +230,22 @@ class _JobRun:
         stats |= {"source": self.dataset.name, "mode": self.job.config.mode, "voxels": largest.voxels(), "volumes": largest.volumes()}
         stats |= {"empty_meshes": largest.empty_meshes}
         stats |= {"maps": [map_table(slam, rank, self.outputs.of(slam.number)) for rank, slam in self._ranked()]}
-        # "not_localised" from run_gaps comes here
+        gaps = self._note_gaps(stats)
+        stats |= {"remarks": self.dataset.remarks}
         stats |= {"skipped": [_line(s) for s in self.record.skipped], "failure": str(failure) if failure else None}
         stats |= {"live": live_table(self.record, *_lags(self.outputs)) if self.job.live else None}
         self.output.write_stats(stats)
         write_report(self.output.path, self.dataset, self.atlas, self.record)
-        return Outcome(self.atlas, self.record, largest.scale, stats)
+        return Outcome(self.atlas, self.record, largest.scale, stats, gaps)
+
+    def _note_gaps(self, stats: dict[str, Any]) -> list[Gap]:
+        """Which frames no map has, into the statistics; and why there is no map, from all frames instead of the last."""
+        notes, width_px = self.atlas.notes, self.dataset.camera.width
+        gaps = find_gaps(notes, [slam.trajectory().timestamps_ns for slam in self.maps], width_px)
+        stats |= {"first_frame_s": notes[0].timestamp_ns / 1e9 if notes else None, "not_localised": gaps_table(gaps)}
+        if not self.maps:
+            stats["initialization_failure"] = no_map_sentence(notes, stats["initialization_failure"], width_px)
+        return gaps
 
 
 def _lags(outputs: MapOutputs) -> tuple[list[float], float | None]:

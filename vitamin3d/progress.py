@@ -42,10 +42,7 @@ class ConsoleObserver:
         signal.signal(signal.SIGINT, self._handler)
 
     def frame_done(self, done: int, total: int, atlas: Atlas) -> None:
-        slam, num_maps = atlas.current, len(atlas.ranked())
-        maps = f"{num_maps} maps, the newest with " if num_maps > 1 else ""
-        note = f"{slam.state.value}, {maps}{slam.map.num_keyframes} keyframes, {len(slam.tracks)} tracks"
-        self._show("tracking and mapping", done, total, note)
+        self._show("tracking and mapping", done, total, _course(atlas))
 
     def keyframe_done(self, done: int, total: int) -> None:
         self._show("reconstructing", done, total, "")
@@ -77,6 +74,16 @@ class ConsoleObserver:
             raise KeyboardInterrupt
         self._stop = True
         self.line("stopping: what is reconstructed so far is being saved (Ctrl-C again: at once, nothing saved)")
+
+
+def _course(atlas: Atlas) -> str:
+    """State, maps and tracks; while the camera is lost in a map, what becomes of the next one comes after it."""
+    slam, num_maps = atlas.current, len(atlas.ranked())
+    counts = f"{slam.map.num_keyframes} keyframes, {len(slam.tracks)} tracks"
+    if slam is not atlas.active:
+        kept = f"{len(atlas.left) + 1} maps" if atlas.left else "the map"
+        return f"{atlas.active.state.value}, {kept} kept; the next one: {slam.state.value}, {counts}"
+    return f"{slam.state.value}, {f'{num_maps} maps, the newest with ' if num_maps > 1 else ''}{counts}"
 
 
 def warmed_up() -> float:

@@ -19,8 +19,11 @@ EMPTY_CONTRAST, NOISE_CONTRAST = 2.0, 5.0
 PLAIN_EXTREMA = 150
 FAST_SHARE, STILL_SHARE = 0.08, 0.001
 """Of the picture's width, from one frame to the next."""
+TRACKED = (SlamState.TRACKING, SlamState.UNCERTAIN)
 MIN_PART = 5
 """Frames; a gap is not split into shorter ones."""
+MOST_TOLD = 5
+"""Gaps that the console names; files have all."""
 ENOUGH, DISORDER, TELLING = 0.9, 1 / 3, 1 / 3
 """Shares of frames: to be localised; breaks, from which on pictures look out of order; of a cause that explains a run without a map."""
 
@@ -48,11 +51,12 @@ RULES: dict[Cause, Callable[[FrameNote, float], bool]] = {
     Cause.FAST: lambda note, width_px: note.motion_px > FAST_SHARE * width_px,
     Cause.TURNING: lambda note, _: note.state is SlamState.ROTATING or "turns but does not travel" in note.reason,
     Cause.STANDING: lambda note, width_px: "the picture moved by" in note.reason and note.motion_px < STILL_SHARE * width_px,
-    Cause.TOO_SHORT: lambda note, _: note.state is SlamState.TRACKING,
+    Cause.TOO_SHORT: lambda note, _: note.state in TRACKED,
     Cause.MOVING: lambda note, _: "not that of a rigid scene" in note.reason,
     Cause.LOST: lambda *_: True,
 }
 """The first that holds, by a frame's note and the picture's width."""
+NO_DEPTH = ": no parallax, no depth"
 TO_BEGIN = "move sideways, slowly, with texture in view and little that moves by itself"
 TO_ORDER = "give pictures in the order in which they were taken, overlapping by two thirds"
 TEXTS = {
@@ -64,8 +68,8 @@ TEXTS = {
     ),
     Cause.PLAIN: ("lost on a plain wall", "keep edges and texture in view: step back, or turn to where things stand"),
     Cause.FAST: ("lost in fast motion or blur", "film slower, with more light (a shorter exposure) or more pictures per second"),
-    Cause.TURNING: ("the camera turns but does not travel: no parallax, no depth", "move sideways while turning"),
-    Cause.STANDING: ("the camera stands still: no parallax, no depth", "move sideways, or leave this part out"),
+    Cause.TURNING: (f"the camera turns but does not travel{NO_DEPTH}", "move sideways while turning"),
+    Cause.STANDING: (f"the camera stands still{NO_DEPTH}", "move sideways, or leave this part out"),
     Cause.TOO_SHORT: ("tracked in a map that was lost when young and dropped", "film this part slower and longer, with more overlap"),
     Cause.MOVING: ("too much moves by itself: the scene is not rigid", "keep what moves small in the picture, or film without it"),
     Cause.LOST: ("lost: the landmarks were not found again", "film slower and with more overlap, or come back to what was seen before"),
@@ -131,7 +135,7 @@ def _causes_in_time(notes: Sequence[FrameNote], width_px: float, in_map: Array) 
     something else; and so are those before the last break that comes before the first map.
     """
     kept = {note.map_number for note, is_in in zip(notes, in_map, strict=True) if is_in}
-    dropped = {note.map_number for note in notes if note.state is SlamState.TRACKING} - kept
+    dropped = {note.map_number for note in notes if note.state in TRACKED} - kept
     plain, begin = _causes(notes, width_px), int(in_map.argmax()) if in_map.any() else -1
     last_break = max((k for k in range(1, begin + 1) if plain[k] is Cause.OTHER_PICTURE), default=0)
     causes, is_cut_off = [], False
@@ -182,26 +186,29 @@ def _commonest(reasons: Iterable[str]) -> str:
     return max(by_kind.values(), key=len)[-1] if by_kind else ""
 
 
-def warning(gaps: Sequence[Gap], num_localised: int, num_frames: int, notes: Sequence[FrameNote] = ()) -> str:
+def longest_told(gaps: Sequence[Gap]) -> list[str]:
+    """A line for each of the longest gaps, in their order, and one for how many more there are."""
+    longest = sorted(sorted(gaps, key=lambda gap: -gap.num_frames)[:MOST_TOLD], key=lambda gap: gap.first_index)
+    others = len(gaps) - len(longest)
+    return [*(gap.sentence for gap in longest), *([f"and {others} more: see stats.json"] if others else [])]
+
+
+def warning(gaps: Sequence[Gap], num_localised: int, num_frames: int, notes: Sequence[FrameNote] = ()) -> list[str]:
     """Lines about a run of `num_frames` asked for, none where 90 % are localised: the longest gaps; disorder (by notes); turning."""
     if num_localised >= ENOUGH * num_frames:
-        return ""
-    lines = [_shortfall(sorted(gaps, key=lambda gap: -gap.num_frames), num_localised, num_frames)]
+        return []
+    unseen = num_frames - num_localised - sum(gap.num_frames for gap in gaps)
+    lines = [f"only {num_localised} of {num_frames} frames are localised", *longest_told(gaps)]
+    lines += [f"{unseen} frames could not be read or were not reached"] if unseen > 0 else []
     breaks = sum(cause is Cause.OTHER_PICTURE for cause in _causes(notes, np.inf))
     if breaks > DISORDER * len(notes):
         lines.append(f"the pictures look out of order or do not overlap: {breaks} of {len(notes)} continue no earlier one; {TO_ORDER}")
     turning = sum(gap.num_frames for gap in gaps if gap.cause is Cause.TURNING)
     if 2 * turning > num_frames:
         lines.append(f"the camera turns without travelling in {turning} of {num_frames} frames: no depth can be had from that")
-    return "\n".join(lines)
-
-
-def _shortfall(longest: list[Gap], num_localised: int, num_frames: int) -> str:
-    others, unseen = len(longest) - 2, num_frames - num_localised - sum(gap.num_frames for gap in longest)
-    parts = [f"only {num_localised} of {num_frames} frames are localised", *(gap.sentence for gap in longest[:2])]
-    parts += [f"and {others} shorter stretch{'es' if others > 1 else ''}"] if others > 0 else []
-    parts += [f"{unseen} could not be read or were not reached"] if unseen > 0 else []
-    return "; ".join([*parts, *(f"remedy: {gap.remedy}" for gap in longest[:1])])
+    if gaps:
+        lines.append(f"what to do about the longest: {max(gaps, key=lambda gap: gap.num_frames).remedy}")
+    return lines
 
 
 def no_map_sentence(notes: Sequence[FrameNote], reason: str, width_px: float) -> str:
@@ -210,12 +217,12 @@ def no_map_sentence(notes: Sequence[FrameNote], reason: str, width_px: float) ->
     cause = _majority([cause for cause in causes if cause is not Cause.LOST] or [Cause.LOST])
     if causes.count(cause) < TELLING * len(notes):
         cause = Cause.LOST
-    count, (what, remedy) = causes.count(cause), TEXTS[cause]
+    count, (text, remedy) = causes.count(cause), TEXTS[cause]
     told = _commonest(note.reason for note, of in zip(notes, causes, strict=True) if of is cause and of is not Cause.TOO_SHORT)
     if cause is Cause.LOST:
         return f"{told or reason}; {TO_BEGIN}" if notes else reason
-    share = f"all {count}" if count == len(notes) else f"{count} of {len(notes)}"
-    return f"{told + '; ' if told else ''}in {share} frames: {what}; {remedy}"
+    share, what = f"all {count}" if count == len(notes) else f"{count} of {len(notes)}", text.removesuffix(NO_DEPTH)
+    return f"{told} ({share} frames); {remedy}" if what in told else f"{told + '; ' if told else ''}in {share} frames: {what}; {remedy}"
 
 
 def gaps_table(gaps: Sequence[Gap]) -> list[dict[str, Any]]:
@@ -223,6 +230,6 @@ def gaps_table(gaps: Sequence[Gap]) -> list[dict[str, Any]]:
     return [gap.as_dict() for gap in gaps]
 
 
-def gap_rows(gaps: Sequence[Gap]) -> list[tuple[str, str, str]]:
-    """For `report.html`: which frames and when, what happened, what to do."""
-    return [(where, what, gap.remedy) for gap in gaps for where, _, what in [gap.sentence.partition(": ")]]
+def gap_rows(table: Sequence[dict[str, Any]]) -> list[tuple[str, str, str]]:
+    """For `report.html`, of the rows of `gaps_table`: which frames and when, what happened, what to do."""
+    return [(where, what, row["remedy"]) for row in table for where, _, what in [row["sentence"].partition(": ")]]

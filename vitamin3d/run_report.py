@@ -24,8 +24,9 @@ from vitamin3d.exporters.files import write_file
 from vitamin3d.exporters.line_plot import Axes, Line, line_plot
 from vitamin3d.exporters.mesh import read_ply
 from vitamin3d.exporters.rendering import jpeg
-from vitamin3d.exporters.report import Picture, Report, evaluation_section, report_html, section_table, with_evaluation
+from vitamin3d.exporters.report import Picture, Report, evaluation_section, report_html, section_table, section_text, with_evaluation
 from vitamin3d.geometry.rolling_shutter import measured_pixels
+from vitamin3d.run_gaps import gap_rows
 from vitamin3d.run_statistics import largest_map
 from vitamin3d.runtime import RunRecord
 from vitamin3d.slam import Slam
@@ -40,7 +41,7 @@ NO_TRAJECTORY = Trajectory(np.zeros(0, np.int64), np.zeros((0, 4, 4)))
 
 
 def write_report(out: Path, dataset: Dataset, atlas: Atlas, record: RunRecord) -> None:
-    """Writes `report.html` beside the other files of a run; it shows the largest map.
+    """Writes `report.html` beside the other files of a run; it shows the largest map, and which frames no map has.
 
     Raises:
         OutputError: it cannot be written.
@@ -120,14 +121,17 @@ def _in_maps(maps: list[dict[str, Any]]) -> str:
 
 
 def _sections(stats: dict[str, Any]) -> list[str]:
-    """Tables of what else there is to say."""
-    maps = stats["maps"]
-    return [_maps_section(maps)] if len(maps) > 1 else []  # the frames that are not localised, from run_gaps, come after it
+    """What else there is to say: why there is no map, or which ones; the frames that none has."""
+    sections = [] if stats["maps"] else [section_text("No map", stats["initialization_failure"])]
+    sections += [_maps_section(stats["maps"], stats["first_frame_s"])] if len(stats["maps"]) > 1 else []
+    if stats["not_localised"]:
+        heads = ("frames", "what happened", "what to do")
+        sections.append(section_table("Frames that are not localised", heads, gap_rows(stats["not_localised"])))
+    return sections
 
 
-def _maps_section(maps: list[dict[str, Any]]) -> str:
-    """The maps of a run, the largest first; times count from the first localised frame."""
-    begin = min(entry["first_frame_s"] for entry in maps)
+def _maps_section(maps: list[dict[str, Any]], begin: float) -> str:
+    """The maps of a run, the largest first; times count from the run's first frame."""
     heads = ("map", "folder", "frames", "from s", "to s", "keyframes", "points", "unit")
     rows = [
         (
@@ -147,7 +151,7 @@ def _maps_section(maps: list[dict[str, Any]]) -> str:
 
 def _cards(stats: dict[str, Any], surface: Surface | None) -> list[tuple[str, str]]:
     rate = stats["processed_frames"] / stats["wall_seconds"] if stats["wall_seconds"] else 0.0
-    cards = [
+    return [
         (f"{100 * stats['success_rate']:.1f} %", "frames localised"),
         (f"{len(stats['maps'])}", "maps" if len(stats["maps"]) != 1 else "map"),
         (f"{stats['keyframes']:,}", "keyframes"),
@@ -158,7 +162,6 @@ def _cards(stats: dict[str, Any], surface: Surface | None) -> list[tuple[str, st
         (f"{stats['peak_memory_mb']:,.0f} MB", "peak memory"),
         (f"{stats['initialization_retries']}", "initialisation retries"),
     ]
-    return cards if stats["keyframes"] else [*cards, ("no map", stats["initialization_failure"])]
 
 
 def _cloud(path: Path) -> tuple[Array, Array]:

@@ -40,8 +40,8 @@ from vitamin3d.types import Array, Frame, FrontEndFrame, Localization, MapSnapsh
 
 IDS_PER_MAP = 1 << 40
 """Tracks of different maps have different ids."""
-UNTAKEN_WINDOWS = 2
-"""Pictures of keyframes that nobody takes are kept for so many windows."""
+UNTAKEN_WINDOWS, UNTAKEN_KEYFRAMES = 2, 30
+"""Pictures of keyframes that nobody takes are kept for so many windows, or keyframes where that is more."""
 
 
 class Slam:
@@ -63,7 +63,9 @@ class Slam:
         self._pending_frames: dict[int, Frame] = {}
         self._directions, self._turns, self._num_doubts = Directions(), Turns(), 0
         self._remembered = RememberedKeyframes(config.relocalization)
+        self._untaken = max(UNTAKEN_KEYFRAMES, UNTAKEN_WINDOWS * config.window.keyframes)
         self._turned_frames: list[int] = []
+        self._num_loose = 0
         self.num_lost = 0
         """Frames in a row in which the camera was not found, less one."""
         self._meetings: list[Array] = []
@@ -110,6 +112,7 @@ class Slam:
     def _track(self, front: FrontEndFrame) -> Tracks:
         """Predict (Eq. 4) and climb (Eq. 5), from the frame that this one continues."""
         if front.follows != self._newest_frame and not self._resume(front.follows):
+            self._image_motion, self._last_ns = NO_MOTION, front.frame.timestamp_ns
             return Tracks.empty()
         if front.dense_flow is not None:
             predicted = predict_by_dense_flow(self.tracks.pixels, front.dense_flow, self.config.extrema_tracking.flow_reduction)
@@ -231,15 +234,34 @@ class Slam:
         mapped = self.map.is_mapped(seen.ids)
         ids, seed = seen.ids[mapped], self.config.seed + front.frame.index
         found = self._pose_of_votes(ids, pixels[mapped], self.poses.predict(self.map), seed)
-        if not found.converged or found.is_inlier.sum() < self.config.localization.min_kept_ratio * self.map.is_mapped(self.tracks.ids).sum():
+        fewest = self.config.localization.min_kept_ratio * self.map.is_mapped(self.tracks.ids).sum()
+        if not found.converged or found.is_inlier.sum() < fewest:
             return self._rotate(front, seen, pixels)
+        self._end_tracks(ids[~found.is_inlier])
+        if self._is_loose(ids[found.is_inlier]):
+            return self._wait(front, found.T_cam_world)
         self.state = SlamState.TRACKING
         self._turned_frames.clear()
-        self._end_tracks(ids[~found.is_inlier])
         recovery = self.config.recovery
         if recovery.enabled and self._frame_count % recovery.interval == 0 and self._recover(front, found.T_cam_world):
             return self._relocalize(found.T_cam_world)
         return found.T_cam_world
+
+    def _is_loose(self, ids: Array) -> bool:
+        """Whether few of the landmarks (N,) ids that localised the camera are known for long: what is new has no say in the scale."""
+        localization = self.config.localization
+        if self.map.num_keyframes < localization.loose_observations * 2:
+            return False
+        return bool((self.map.num_observations[ids] >= localization.loose_observations).sum() < localization.min_known)
+
+    def _wait(self, front: FrontEndFrame, T_cam_world: Array) -> Array | None:
+        """A frame whose pose hangs on few landmarks is logged, and adds nothing to the map; for a while, then the camera must be found."""
+        self._num_loose = self._num_loose + 1 if self.state is SlamState.UNCERTAIN else 1
+        if self._num_loose > self.config.localization.max_loose_frames:
+            return self._find_camera(front)
+        self.state = SlamState.UNCERTAIN
+        self.poses.add_world(front.frame, T_cam_world, self.map)
+        return None
 
     def _rotate(self, front: FrontEndFrame, seen: Tracks, pixels: Array) -> Array | None:
         """Where the landmarks have left the picture but it only turned, its frame is logged; else the camera must be found.
@@ -306,7 +328,9 @@ class Slam:
         before = self.tracks.ids
         image, recovery, motion = front.frame.image, self.config.recovery, self._image_motion
         recovery = recovery if gate_px is None else replace(recovery, gate_px=gate_px)
-        self.tracks, meetings = recover_landmarks(self.tracks, self.map, image, front.kappa, motion, T_cam_world, self.camera, recovery)
+        self.tracks, meetings = recover_landmarks(
+            self.tracks, self.map, image, front.kappa, motion, T_cam_world, self.camera, recovery, front.noise
+        )
         self._meetings.append(meetings)
         return int((~np.isin(self.tracks.ids, before, kind="table")).sum())
 
@@ -351,7 +375,7 @@ class Slam:
     def _add_keyframe(self, front: FrontEndFrame, T_cam_world: Array) -> int:
         keyframe = add_view(self.map, TrackedView(front.frame, *self._seen(), self._image_motion), T_cam_world)
         self._pending_frames[keyframe] = front.frame
-        self._pending_frames.pop(keyframe - UNTAKEN_WINDOWS * self.config.window.keyframes, None)
+        self._pending_frames.pop(keyframe - self._untaken, None)
         self._remembered.add(keyframe, front.frame)
         return keyframe
 
@@ -404,7 +428,7 @@ class Slam:
         with self.times.timed("condense"):
             self.take_adjustment(wait=True)
             needed = np.concatenate([self.tracks.ids, *(pair.ravel() for pair in self._meetings)])
-            done = condense(self.map, np.unique(needed), UNTAKEN_WINDOWS * self.config.window.keyframes, self.config.memory)
+            done = condense(self.map, np.unique(needed), self._untaken, self.config.memory)
             self.poses.move_to(done.kept_keyframes, self.map)
             born = self.unique_ids(np.append(done.kept_ids, self._next_id)) - self.number * IDS_PER_MAP
             self._unique_ids, self._num_forgotten = born[:-1], int(born[-1]) - len(done.kept_ids)

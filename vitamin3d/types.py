@@ -65,6 +65,8 @@ class FrontEndFrame:
     follows: int | None = None
     """Index of the frame whose tracks go on in this one: the previous, an earlier one where pictures between were of something
     else, None where the picture continues none of them."""
+    noise: float = 0.0
+    """Standard deviation of the noise of this picture and those before it, grey levels; 0 where it is not measured."""
 
 
 @dataclass(frozen=True)

@@ -80,7 +80,9 @@ def test_the_paper_differs_where_the_paper_does():
     assert not paper.recovery.enabled and paper.window.anchors == 0
     assert paper.bundle_adjustment.keyframe_solver == "subspace"
     assert paper.extrema.min_roundness == paper.extrema_tracking.min_roundness == 0.0  # "all extrema"
-    same = ("dominant_flow", "initialization", "triangulation", "nltgv")
+    assert not paper.continuity.enabled and not paper.rotation.enabled and not paper.relocalization.enabled
+    assert paper.extrema.wanted == paper.extrema_tracking.gate_medians == paper.localization.votes == paper.triangulation.max_rms_px == 0
+    same = ("dominant_flow", "initialization", "nltgv", "atlas")
     assert all(getattr(paper, group) == getattr(Config(), group) for group in same)
 
 

@@ -21,6 +21,7 @@ from vitamin3d.types import DominantFlow, Tracks
 
 CONFIG = ExtremaTrackingConfig()
 ANY_SHAPE = dataclasses.replace(CONFIG, min_roundness=0.0)
+FIXED_GATE = dataclasses.replace(CONFIG, gate_medians=0.0)
 
 
 def tracks_at(pixels, ids=None, ages=None, missed=None):
@@ -31,39 +32,47 @@ def tracks_at(pixels, ids=None, ages=None, missed=None):
 
 def climbed(kappa, predicted, config):
     n = len(predicted)
-    out, values, found = np.empty((n, 2)), np.empty(n, np.float32), np.empty(n, np.bool_)
+    out, values, distances = np.empty((n, 2)), np.empty(n, np.float32), np.empty(n)
     weight, sigma = config.prediction_weight, config.prediction_sigma_px
-    _climb_all(kappa, predicted, weight, sigma, config.max_steps, config.gate_px, config.min_roundness, out, values, found)
-    return out, values, found
+    _climb_all(kappa, predicted, weight, sigma, config.max_steps, config.gate_px, config.min_roundness, out, values, distances)
+    return out, values, distances
 
 
 @pytest.mark.parametrize("shape", [(3, 3), (3, 30), (25, 31)])
-@pytest.mark.parametrize("config", [ANY_SHAPE, dataclasses.replace(ANY_SHAPE, gate_px=8.0, max_steps=2, prediction_weight=2.0)])
+@pytest.mark.parametrize(
+    "config",
+    [
+        ANY_SHAPE,
+        dataclasses.replace(ANY_SHAPE, gate_px=8.0, max_steps=2, prediction_weight=2.0),
+        dataclasses.replace(CONFIG, gate_px=2.5, min_roundness=0.6),
+    ],
+)
 def test_climbing_equals_its_twin(rng, shape, config):
     kappa = rng.standard_normal(shape).astype(np.float32)
     predicted = rng.uniform(-2, [shape[1] + 1, shape[0] + 1], (200, 2))
-    out, values, found = climbed(kappa, predicted, config)
+    out, values, distances = climbed(kappa, predicted, config)
+    settings = config.prediction_weight, config.prediction_sigma_px, config.max_steps, config.gate_px, config.min_roundness
     for i, p in enumerate(predicted):
-        twin = reference.climbed(kappa, p, config.prediction_weight, config.prediction_sigma_px, config.max_steps, config.gate_px)
-        assert found[i] == (twin is not None), (p, twin)
+        twin = reference.climbed(kappa, p, *settings)
+        assert distances[i] == pytest.approx(np.inf if twin is None else np.linalg.norm(twin - p), abs=1e-4), (p, twin)
         np.testing.assert_allclose(out[i], p if twin is None else twin, atol=1e-4)
-        assert (values[i] > 0) == found[i]
-    assert not found.all() and (found.any() or shape == (3, 3))
+        assert (values[i] > 0) == np.isfinite(distances[i])
+    assert not np.isfinite(distances).all() and (np.isfinite(distances).any() or shape == (3, 3))
 
 
 def test_the_prediction_pulls_at_an_even_ridge():
     kappa = np.zeros((21, 41), np.float32)
     kappa[10] = 1.0
     predicted = np.array([[17.0, 10.0], [30.2, 10.0]])
-    out, _, found = climbed(kappa, predicted, ANY_SHAPE)
-    assert found.all() and not climbed(kappa, predicted, CONFIG)[2].any()
+    out, _, distances = climbed(kappa, predicted, ANY_SHAPE)
     np.testing.assert_allclose(out, [[17, 10], [30, 10]], atol=0.5)
+    np.testing.assert_allclose(distances, np.linalg.norm(out - predicted, axis=1), atol=1e-12)
+    assert np.isinf(climbed(kappa, predicted, CONFIG)[2]).all()
 
 
 def test_nan_curvature_is_never_found(rng):
     kappa = np.full((20, 20), np.nan, np.float32)
-    _, _, found = climbed(kappa, rng.uniform(3, 17, (20, 2)), CONFIG)
-    assert not found.any()
+    assert np.isinf(climbed(kappa, rng.uniform(3, 17, (20, 2)), CONFIG)[2]).all()
 
 
 def test_flow_samples_equal_their_twin(rng):
@@ -124,12 +133,50 @@ def test_extrema_are_followed_through_a_known_warp(moving, rng):
     assert (seen.ages == 1).all() and (seen.kappa > 0).all()
 
 
-def test_a_wrong_prediction_is_a_miss_not_a_jump(moving):
+@pytest.mark.parametrize(("config", "limit_px"), [(CONFIG, CONFIG.max_gate_px), (FIXED_GATE, FIXED_GATE.gate_px)])
+def test_a_wrong_prediction_is_a_miss_not_a_jump(moving, config, limit_px):
     pixels, truth, kappa = moving
-    found = track_extrema(tracks_at(pixels), truth + np.array([0.0, 6.0]), kappa, CONFIG)
+    found = track_extrema(tracks_at(pixels), truth + np.array([0.0, 6.0]), kappa, config)
     seen = found.select(found.missed == 0)
-    assert (np.linalg.norm(seen.pixels - truth[seen.ids] - [0.0, 6.0], axis=1) <= CONFIG.gate_px).all()
+    assert (np.linalg.norm(seen.pixels - truth[seen.ids] - [0.0, 6.0], axis=1) <= limit_px).all()
     assert len(seen) < 0.6 * len(pixels)
+
+
+def columns(*distances, missed=None):
+    """Tracks of lonely maxima in a row, predicted so many pixels beside them; and their curvature."""
+    v, u = np.mgrid[:40, : 20 * len(distances) + 20]
+    kappa = (5.0 * np.exp(-((u - np.clip(20 * np.rint(u / 20), 20, u.max() - 19)) ** 2 + (v - 20) ** 2) / 8)).astype(np.float32)
+    return tracks_at([[20.0 * (n + 1) + d, 20.0] for n, d in enumerate(distances)], missed=missed), kappa
+
+
+def tracked(tracks, kappa, config=CONFIG):
+    return track_extrema(tracks, tracks.pixels, kappa, config)
+
+
+@pytest.mark.parametrize(
+    ("distances", "gate_px"),
+    [
+        ([0.1] * 7, 1.05),  # never narrower than that
+        ([1.2] * 7, 1.5),  # 1.25 medians
+        ([2.4] * 7, 2.5),  # never wider than that
+        ([0.4] * 3 + [1.4] * 4, 1.75),
+        ([0.4] * 4 + [1.4] * 3, 1.05),
+    ],
+)
+def test_the_gate_is_as_wide_as_the_flow_is_inexact(distances, gate_px):
+    for last, is_found in ((gate_px - 0.04, True), (gate_px + 0.04, False)):
+        tracks, kappa = columns(*distances, last, missed=[0] * len(distances) + [1])  # what coasts does not tell of the flow
+        moved = tracked(tracks, kappa)
+        assert (moved.missed[-1] == 0) == is_found, (last, moved.missed)
+        np.testing.assert_allclose(moved.pixels[-1, 0], 20.0 * len(tracks) + (0.0 if is_found else last))
+        assert moved.kappa[-1] == (5.0 if is_found else tracks.kappa[-1])
+    assert tracked(*columns(*distances, 1.09), FIXED_GATE).missed[-1] == 1
+
+
+def test_the_gate_of_tracks_that_all_coast_or_find_nothing_is_the_narrowest():
+    assert tracked(*columns(1.0, 1.2, missed=[1, 1])).missed.tolist() == [0, 2]
+    tracks, kappa = columns(1.0, 1.2)
+    assert tracked(tracks, 0.0 * kappa).missed.tolist() == [1, 1]
 
 
 def test_a_track_coasts_so_many_frames_and_is_then_dropped():

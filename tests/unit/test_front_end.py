@@ -1,5 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
+from dataclasses import replace
+
 import numpy as np
+import pytest
 from scenes import texture, warped
 
 from vitamin3d.config import Config, paper_config
@@ -9,6 +12,10 @@ from vitamin3d.tracking.front_end import FrontEnd
 from vitamin3d.types import Frame
 
 SHIFT = np.array([4.0, -3.0])
+
+
+def with_extrema(**settings):
+    return replace(Config(), extrema=replace(Config().extrema, **settings))
 
 
 def frames():
@@ -36,14 +43,69 @@ def test_the_paper_uses_dominant_flow_instead():
     assert second.dominant_flow.inlier_ratio > 0.5
 
 
-def test_curvature_and_extrema_are_those_of_the_frame():
-    config = Config()
+@pytest.mark.parametrize("config", [paper_config(), with_extrema(wanted=0)], ids=["paper", "fixed"])
+def test_curvature_and_extrema_are_those_of_the_frame(config):
     frame = frames()[1]
     front = FrontEnd(config).process(frame)
     assert front.frame is frame
     np.testing.assert_array_equal(front.kappa, curvature(frame.image, config.curvature))
     np.testing.assert_array_equal(front.extrema, detect_extrema(front.kappa, config.extrema))
     assert len(front.extrema) > 20
+
+
+@pytest.mark.parametrize("wanted", [40, 60, 100])
+def test_curvature_is_scaled_so_that_the_floor_sinks_to_the_extremum_wanted(wanted):
+    config, frame = with_extrema(wanted=wanted, min_curvature=1e3), frames()[1]
+    front = FrontEnd(config).process(frame)
+    raw = curvature(frame.image, config.curvature)
+    every = detect_extrema(raw, replace(config.extrema, min_curvature=0.02))
+    np.testing.assert_array_equal(front.extrema, every[:wanted])
+    floor = raw[every[wanted - 1, 1], every[wanted - 1, 0]]
+    assert 0.02 < floor < 1e3
+    np.testing.assert_allclose(front.kappa, raw * (1e3 / floor), rtol=1e-5)
+    assert front.kappa[front.extrema[-1, 1], front.extrema[-1, 0]] == pytest.approx(1e3, rel=1e-5)
+
+
+@pytest.mark.parametrize(
+    ("settings", "floor"),
+    [({"wanted": 5}, 0.15), ({"wanted": 10**6}, 0.02), ({"wanted": 10**6, "lowest_curvature": 0.4}, 0.4)],
+    ids=["textured", "plain", "lowest above the usual"],
+)
+def test_the_floor_stays_between_its_bounds(settings, floor):
+    config, frame = with_extrema(**settings), frames()[1]
+    front, raw = FrontEnd(config).process(frame), curvature(frame.image, config.curvature)
+    np.testing.assert_allclose(front.kappa, raw * (0.15 / floor), rtol=1e-5)
+    np.testing.assert_array_equal(front.extrema, detect_extrema(raw, replace(config.extrema, min_curvature=floor)))
+
+
+def test_a_noisy_picture_has_its_floor_above_the_noise():
+    clean, config = frames()[1], Config()
+    assert len(FrontEnd(config).process(clean).extrema) > 100
+    counts = []
+    for deviation in (3.0, 6.0, 12.0):
+        grey = Frame(0, 0, np.clip(128 + deviation * np.random.default_rng(1).standard_normal((240, 320)), 0, 255).astype(np.uint8))
+        counts.append([len(FrontEnd(c).process(grey).extrema) for c in (config, with_extrema(noise_curvature=0.0))])
+    with_floor, without = zip(*counts, strict=True)
+    assert max(with_floor) < 5 and without[2] > 300
+
+
+def test_unblurred_and_empty_pictures_pass():
+    unblurred = replace(Config(), curvature=replace(Config().curvature, smoothing_sigma_px=0.0))
+    assert len(FrontEnd(unblurred).process(frames()[0]).extrema) > 100
+    black = FrontEnd(Config()).process(Frame(0, 0, np.zeros((240, 320), np.uint8)))
+    assert len(black.extrema) == 0 and (black.kappa == 0).all()
+
+
+def test_each_frame_follows_the_one_before_until_the_picture_is_another():
+    for config, expected in ((Config(), [None, 9, None, None, 11]), (paper_config(), [None, 9, 11, 12, 14])):
+        front_end, (a, b) = FrontEnd(config), frames()
+        stray = texture(240, 320, np.random.default_rng(4), 6.0)
+        pictures = ((9, a.image), (11, b.image), (12, stray), (14, np.zeros_like(stray)), (15, b.image))
+        fronts = [front_end.process(Frame(index, index, picture)) for index, picture in pictures]
+        assert [front.follows for front in fronts] == expected
+        if config.continuity.enabled:
+            assert [front.dense_flow is None for front in fronts] == [follows is None for follows in expected]
+            assert np.abs(fronts[4].dense_flow).max() < 0.5  # from the frame followed
 
 
 def test_steps_are_timed_once_per_frame():

@@ -1,6 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """Landmarks: triangulated, found again, and what is known about them."""
 
+import copy
 import dataclasses
 
 import numpy as np
@@ -28,7 +29,7 @@ from vitamin3d.mapping.landmark_statistics import (
     relative_depth_deviations,
     unit_information,
 )
-from vitamin3d.mapping.landmark_triangulation import triangulate_landmarks
+from vitamin3d.mapping.landmark_triangulation import _squared_errors, triangulate_landmarks
 from vitamin3d.mapping.sparse_map import SparseMap
 from vitamin3d.tracking.curvature import curvature
 from vitamin3d.tracking.extrema import detect_extrema, refine_extrema
@@ -72,7 +73,56 @@ def test_points_need_to_reproject():
     points = np.array([[0.1, 0.2, 3.0]])
     for offset, count in ((5.8, 1), (6.3, 0)):  # half of a sideways offset in each picture, above 3 px too much
         sparse_map = two_keyframes(points, SIDEWAYS, (0.0, offset))
-        assert triangulate_landmarks(sparse_map, PINHOLE, TriangulationConfig(max_reprojection_px=3.0)) == count, offset
+        config = TriangulationConfig(max_reprojection_px=3.0, max_rms_px=0.0)
+        assert triangulate_landmarks(sparse_map, PINHOLE, config) == count, offset
+
+
+def test_points_need_all_their_observations_to_agree(scene, rng):
+    """What slides along an edge, or steps from one extremum to the next, may fit the first and the newest view."""
+    sparse_map = map_of(scene, with_points=False)
+    seen = [np.flatnonzero(scene.obs_point == p) for p in range(300)]
+    newest = [p for p in range(300) if scene.obs_camera[seen[p][-1]] == 7]
+    stepping, sliding, jittery, removed = newest[:4]
+    sparse_map.obs_pixels[seen[stepping][1:-1]] += [4.0, 0.0]
+    sparse_map.obs_pixels[seen[sliding][1:-1], 0] += 3.0 * np.sin(np.linspace(0, np.pi, len(seen[sliding]))[1:-1])
+    sparse_map.obs_pixels[seen[jittery][1:-1]] += 0.5 * rng.choice([-1, 1], (len(seen[jittery]) - 2, 2))
+    middle = seen[removed][len(seen[removed]) // 2]
+    sparse_map.obs_pixels[middle] += [40.0, 0.0]
+    sparse_map.obs_valid[middle] = False
+    strict, paper = copy.deepcopy(sparse_map), TriangulationConfig(max_rms_px=0.0)
+    assert triangulate_landmarks(strict, PINHOLE, TriangulationConfig()) == len(newest) - 2
+    assert strict.is_mapped(np.array(newest)).tolist() == [False, False] + [True] * (len(newest) - 2)
+    short = copy.deepcopy(sparse_map)
+    assert triangulate_landmarks(short, PINHOLE, TriangulationConfig(checked_keyframes=1)) == len(newest)
+    assert triangulate_landmarks(sparse_map, PINHOLE, paper) == len(newest)
+    np.testing.assert_array_equal(strict.points_world[newest[2:]], sparse_map.points_world[newest[2:]])
+
+
+@pytest.mark.parametrize("oldest", [0, 3, 7])
+def test_squared_errors_equal_their_twin(scene, rng, oldest):
+    noisy, _ = with_noise(scene, rng, 1.0)
+    sparse_map = map_of(noisy)
+    sparse_map.obs_valid[rng.random(len(noisy.pixels)) < 0.2] = False
+    ids = rng.permutation(300)[:120]
+    first, points = sparse_map.first_observation[ids].copy(), scene.points[ids] + 0.05 * rng.standard_normal((120, 3))
+    first[:20] += rng.integers(0, 1500, 20)  # tracks that started afresh
+    points[20] = [0.0, 0.0, -3.0]
+    wanted = np.full(300, -1, np.int64)
+    wanted[ids] = np.arange(120)
+    squared, count = np.full(120, 0.5), np.full(120, 2)  # the sums are added to
+    poses, starts = sparse_map.T_cam_world, np.array(sparse_map.keyframe_starts)
+    R, t = np.ascontiguousarray(poses[:, :3, :3]), np.ascontiguousarray(poses[:, :3, 3])
+    observed = sparse_map.obs_landmark, sparse_map.obs_valid, sparse_map.obs_pixels
+    _squared_errors(PINHOLE.intrinsics, R, t, starts, oldest, *observed, first, points, wanted, squared, count)
+    for at, id_ in enumerate(ids):
+        errors = []
+        for k in range(oldest, 8):
+            for i in range(starts[k], starts[k + 1]):
+                if sparse_map.obs_landmark[i] == id_ and sparse_map.obs_valid[i] and i >= first[at]:
+                    r = reference.residual(PINHOLE.intrinsics, poses[k], points[at], sparse_map.obs_pixels[i])
+                    errors.append(np.inf if r is None else r @ r)
+        assert count[at] == 2 + len(errors)
+        assert squared[at] == pytest.approx(0.5 + sum(errors), rel=1e-9)
 
 
 def test_points_need_to_lie_in_front():

@@ -113,6 +113,60 @@ def test_a_small_share_of_inliers_does_not_converge(rng, min_ratio, converges):
     assert found.converged == converges and found.is_inlier[~is_outlier].sum() == 45
 
 
+def numbers(*counts):
+    """So many landmarks with so many observations each."""
+    return np.concatenate([np.full(count, observations, np.int32) for count, observations in counts])
+
+
+@pytest.mark.parametrize(
+    ("num_observations", "fewest"),
+    [
+        (numbers((60, 8), (500, 7)), 8),
+        (numbers((59, 9), (1, 7), (500, 3)), 4),
+        (numbers((20, 9), (39, 5), (1, 3), (9, 1)), 2),
+        (numbers((10, 3), (9, 1)), 2),
+        (numbers((0, 1)), 2),
+    ],
+)
+def test_landmarks_with_many_observations_vote_and_where_they_are_few_those_with_half_as_many(num_observations, fewest):
+    np.testing.assert_array_equal(loc.voters(num_observations, CONFIG), num_observations >= fewest)
+
+
+def test_without_votes_all_landmarks_localise():
+    assert loc.voters(numbers((5, 1), (5, 9)), LocalizationConfig(votes=0)).all()
+
+
+def test_voters_alone_decide_and_judge_the_others(rng):
+    points, pixels, _ = view(rng, 400, 0.0, 0.4)
+    elsewhere = exp_se3(np.array([0.3, -0.2, 0.1, 0.01, 0.05, 0.02])) @ TRUTH
+    pixels[100:340] = project(PINHOLE, elsewhere, points[100:340])  # a majority agrees on another pose
+    is_voter = np.arange(400) < 100
+    found = loc.localize_by(is_voter, points, pixels, None, PINHOLE, CONFIG, seed=2)
+    alone = loc.localize(points[:100], pixels[:100], None, PINHOLE, CONFIG, seed=2)
+    assert found.converged and found.T_cam_world.tobytes() == alone.T_cam_world.tobytes() and found.rmse_px == alone.rmse_px
+    np.testing.assert_allclose(found.T_cam_world, TRUTH, atol=5e-3)
+    np.testing.assert_array_equal(found.is_inlier[:100], alone.is_inlier)
+    assert found.is_inlier[100:340].mean() < 0.1 and found.is_inlier[340:].mean() > 0.9
+    whole = loc.localize(points, pixels, None, PINHOLE, CONFIG, seed=2)
+    assert whole.is_inlier[100:340].mean() > 0.9
+
+
+def test_voters_that_disagree_find_nothing_whatever_the_others_say(rng):
+    points, pixels, _ = view(rng, 400, 0.25)
+    is_voter = np.arange(400) < 100  # the outliers
+    found = loc.localize_by(is_voter, points, pixels, TRUTH, PINHOLE, CONFIG)
+    assert not found.converged and found.is_inlier.shape == (400,) and not found.is_inlier.any()
+    none = loc.localize_by(np.zeros(400, np.bool_), points, pixels, TRUTH, PINHOLE, CONFIG)
+    assert not none.converged and not none.is_inlier.any()
+    np.testing.assert_array_equal(none.T_cam_world, TRUTH)
+
+
+def test_where_all_vote_it_is_the_usual_localisation(rng):
+    points, pixels, _ = view(rng, 200, 0.3, 0.5)
+    a, b = (f(points, pixels, None, PINHOLE, CONFIG, 7) for f in (loc.localize, lambda *x: loc.localize_by(np.ones(200, np.bool_), *x)))
+    assert a.T_cam_world.tobytes() == b.T_cam_world.tobytes() and (a.is_inlier == b.is_inlier).all() and a.rmse_px == b.rmse_px
+
+
 @pytest.mark.parametrize("prior", [None, TRUTH])
 def test_garbage_does_not_converge(rng, prior):
     points, pixels = rng.uniform(-5, 5, (200, 3)), rng.uniform(0, 480, (200, 2))

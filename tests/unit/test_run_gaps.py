@@ -6,7 +6,7 @@ import json
 import numpy as np
 import pytest
 
-from vitamin3d.run_gaps import Cause, find_gaps, gap_rows, gaps_table, no_map_sentence, warning
+from vitamin3d.run_gaps import Cause, find_gaps, gap_rows, gaps_table, longest_told, no_map_sentence, warning
 from vitamin3d.types import FrameNote, SlamState
 
 WIDTH, START_NS, STEP_NS = 640, 10**18, 33_333_333
@@ -166,36 +166,46 @@ def test_a_standing_start_is_no_other_picture():
 def test_no_warning_from_nine_tenths_on():
     stretches = (45, SEEN), (10, PLAIN), (45, SEEN)
     gaps = gaps_of(*stretches)
-    assert warning(gaps, 90, 100) == "" == warning([], 0, 0) and warning(gaps, 89, 100) != ""
+    assert warning(gaps, 90, 100) == [] == warning([], 0, 0) and warning(gaps, 89, 100) != []
 
 
 def test_the_warning_names_the_longest_stretches_and_the_remedy_of_the_longest():
     gaps = gaps_of((10, SEEN), (2, LOST), (10, SEEN), (20, DARK), (10, SEEN), (30, PLAIN), (10, SEEN))
-    assert warning(gaps, 40, 95) == (
-        "only 40 of 95 frames are localised; frames 52–81 (1.7–2.7 s): lost on a plain wall; "
-        "frames 22–41 (0.7–1.4 s): too dark to see anything: darkness or a covered lens; and 1 shorter stretch; "
-        "3 could not be read or were not reached; remedy: keep edges and texture in view: step back, or turn to where things stand"
-    )
-    assert warning([], 40, 95) == "only 40 of 95 frames are localised; 55 could not be read or were not reached"
-    assert "and 2 shorter stretches;" in warning([*gaps, *gaps[:1]], 40, 95)
+    assert warning(gaps, 40, 95) == [
+        "only 40 of 95 frames are localised",
+        "frames 10–11 (0.3–0.4 s): lost: the landmarks were not found again",
+        "frames 22–41 (0.7–1.4 s): too dark to see anything: darkness or a covered lens",
+        "frames 52–81 (1.7–2.7 s): lost on a plain wall",
+        "3 frames could not be read or were not reached",
+        "what to do about the longest: keep edges and texture in view: step back, or turn to where things stand",
+    ]
+    assert warning([], 40, 95) == ["only 40 of 95 frames are localised", "55 frames could not be read or were not reached"]
+
+
+def test_five_stretches_are_told():
+    gaps = gaps_of(*[part for count in (3, 9, 1, 8, 7, 2, 6) for part in ((10, SEEN), (count, PLAIN))])
+    lines = longest_told(gaps)
+    told = "10–12", "23–31", "53–60", "71–77", "100–105"
+    assert [line.split(" (")[0] for line in lines] == [*(f"frames {where}" for where in told), *lines[5:]]
+    assert lines[5:] == ["and 2 more: see stats.json"]
+    assert longest_told(gaps[:5]) == [gap.sentence for gap in gaps[:5]] and longest_told([]) == []
 
 
 def test_pictures_out_of_order_are_called_so():
     notes, maps = run((19, SEEN), *[(1, CUT), (1, LOST)] * 20)
-    first, second = warning(find_gaps(notes, maps, WIDTH), 19, 59, notes).splitlines()
-    assert first.startswith("only 19 of 59 ") and "--start" not in first
-    assert second.startswith("the pictures look out of order or do not overlap: 20 of 59 continue no earlier one; give ")
+    first, *_, told, last = warning(find_gaps(notes, maps, WIDTH), 19, 59, notes)
+    assert first.startswith("only 19 of 59 ") and "--start" not in last
+    assert told.startswith("the pictures look out of order or do not overlap: 20 of 59 continue no earlier one; give ")
     for other in ([(20, CUT), (20, LOST)], [(40, DARK)]):
         notes, maps = run((20, SEEN), *other)
-        assert len(warning(find_gaps(notes, maps, WIDTH), 20, 60, notes).splitlines()) == 1
+        assert not any("out of order or do not overlap" in line for line in warning(find_gaps(notes, maps, WIDTH), 20, 60, notes))
 
 
 def test_a_camera_that_turns_is_called_so():
     notes, maps = run((40, TURNING), (20, SEEN))
-    assert warning(find_gaps(notes, maps, WIDTH), 20, 60, notes).splitlines()[1:] == [
-        "the camera turns without travelling in 40 of 60 frames: no depth can be had from that"
-    ]
-    assert "\n" not in warning(find_gaps(notes, maps, WIDTH), 20, 80, notes)
+    line = "the camera turns without travelling in 40 of 60 frames: no depth can be had from that"
+    assert line in warning(find_gaps(notes, maps, WIDTH), 20, 60, notes)
+    assert not any("without travelling" in line for line in warning(find_gaps(notes, maps, WIDTH), 20, 80, notes))
 
 
 @pytest.mark.parametrize(
@@ -203,7 +213,7 @@ def test_a_camera_that_turns_is_called_so():
     [
         ([(12, DARK | {"reason": FEW})], f"{FEW}; in all 12 frames: too dark", "lens"),
         ([(12, STANDING)], f"{STILL}; in all 12 frames: the camera stands still", "leave this part out"),
-        ([(9, WAITING), (31, TURNING)], f"{TURN}; in 31 of 40 frames: the camera turns", "move sideways while turning"),
+        ([(9, WAITING), (31, TURNING)], f"{TURN} (31 of 40 frames); ", "move sideways while turning"),
         ([(30, INITIALIZING | {"reason": RIGID}), (9, DARK)], f"{RIGID}; in 30 of 39 frames: too much moves by itself", "film without it"),
         ([(9, {"state": SlamState.TRACKING}), (1, LOST)], "in all 10 frames: tracked in a map that was lost when young", "overlap"),
         ([(9, INITIALIZING | {"reason": FEW, "num_extrema": 60})], f"{FEW}; in all 9 frames: lost on a plain wall", "things stand"),
@@ -237,8 +247,8 @@ def test_tables_for_json_and_for_the_report():
         (9, 9, 1, "other picture"),
     ]
     assert table[0] == gaps[0].as_dict() and table[0]["first_ns"] == START_NS + 3 * STEP_NS
-    assert [row[:2] for row in gap_rows(gaps)] == [
+    assert [row[:2] for row in gap_rows(table)] == [
         ("frames 3–6 (0.1–0.2 s)", "lost on a plain wall"),
         ("frame 9 (0.3 s)", "of something else: a cut, a stray picture, or pictures out of order or without overlap"),
     ]
-    assert [row[2] for row in gap_rows(gaps)] == [gap.remedy for gap in gaps] and gap_rows([]) == gaps_table([]) == []
+    assert [row[2] for row in gap_rows(table)] == [gap.remedy for gap in gaps] and gap_rows([]) == gaps_table([]) == []

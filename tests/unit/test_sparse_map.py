@@ -182,6 +182,24 @@ def test_the_trajectory_is_camera_to_world_by_time(scene):
     assert PoseLog().trajectory(sparse_map).T_world_cam.shape == (0, 4, 4)
 
 
+def test_forgotten_frames_leave_no_trace_and_may_come_again(scene):
+    sparse_map, log, between = logged(scene)
+    np.testing.assert_array_equal(log.newest(sparse_map), log.pose(11, sparse_map))
+    whole = log.trajectory(sparse_map)
+    log.forget([70, 20])
+    assert (70 in log, 20 in log, 11 in log, len(log)) == (False, False, True, 7)
+    left = log.trajectory(sparse_map)
+    np.testing.assert_array_equal(left.timestamps_ns, np.delete(whole.timestamps_ns, [3, 8]))
+    np.testing.assert_array_equal(left.T_world_cam, np.delete(whole.T_world_cam, [3, 8], axis=0))
+    log.add(Frame(20, 2 * 10**9, NO_PICTURE), 2, np.eye(4))
+    log.add_world(Frame(75, 75 * 10**8, NO_PICTURE), between, sparse_map)
+    assert 20 in log and len(log) == len(log.trajectory(sparse_map)) == 9
+    np.testing.assert_allclose(log.newest(sparse_map), between, atol=1e-13)
+    np.testing.assert_array_equal(np.delete(log.trajectory(sparse_map).T_world_cam, 8, axis=0), np.delete(whole.T_world_cam, 8, axis=0))
+    log.forget([])
+    assert len(log) == 9
+
+
 def test_prediction_goes_on_as_before(scene):
     sparse_map, log = map_of(scene), PoseLog()
     step = exp_se3(np.array([0.1, 0, 0.05, 0, 0.02, 0.01]))

@@ -20,7 +20,7 @@ TURNING = exp_se3(np.array([0.0, 0, 0, 0.02, 0.15, 0.03]))
 
 def test_a_moving_camera_is_accepted(rng):
     attempt = initialize_from_two_views(*two_views(MOVING, rng)[1:], PINHOLE, CONFIG)
-    assert attempt.reason == "" and not attempt.is_retry
+    assert attempt.reason == "" and not attempt.is_retry and 3.0 < attempt.parallax_deg < 10.0  # 0.5 units, seen from 3 to 8
     assert np.degrees(np.linalg.norm(log_so3(attempt.view.T_1_0[:3, :3].T @ MOVING[:3, :3]))) < 0.3
     direction = MOVING[:3, 3] / np.linalg.norm(MOVING[:3, 3])
     assert attempt.view.T_1_0[:3, 3] @ direction > np.cos(np.radians(3))
@@ -30,7 +30,7 @@ def test_a_moving_camera_is_accepted(rng):
 def test_a_standing_camera_is_refused(rng):
     attempt = initialize_from_two_views(*two_views(np.eye(4), rng)[1:], PINHOLE, CONFIG)
     assert attempt.view is None and not attempt.is_retry
-    assert attempt.reason.startswith("no parallax: the picture moved by 0.")
+    assert attempt.reason.startswith("no parallax: the picture moved by 0.") and attempt.parallax_deg == 0.0
 
 
 @pytest.mark.parametrize("seed", range(5))
@@ -39,7 +39,8 @@ def test_a_turning_camera_is_refused(seed):
     assert median_motion(*pixels) > 60
     attempt = initialize_from_two_views(*pixels, PINHOLE, CONFIG)
     assert attempt.view is None and not attempt.is_retry
-    assert "no parallax" in attempt.reason and "turns but does not travel" in attempt.reason
+    assert f"no parallax: {attempt.parallax_deg:.2f}° in" in attempt.reason and "turns but does not travel" in attempt.reason
+    assert 0.0 < attempt.parallax_deg < 0.2
 
 
 def test_too_few_tracks_are_refused(rng):

@@ -20,10 +20,6 @@ if TYPE_CHECKING:
     from vitamin3d.job import Job, Outcome
 
 
-LOW_SUCCESS = 0.9
-"""A run that localises a smaller share of its frames is warned about."""
-
-
 class Mode(str, Enum):
     """Named settings."""
 
@@ -141,6 +137,8 @@ def _run(source: Path, calibration: Path | None, job: "Job", out: Path, overwrit
     dataset = open_dataset(source, calibration)
     job.selection.indices(len(dataset))
     output = OutputFolder(out, overwrite)
+    for remark in [] if quiet else dataset.remarks:
+        typer.echo(remark, err=True)
     if not kernels_are_cached():
         typer.echo("first run: the numerical kernels are being compiled, once; this takes about a minute", err=True)
         warmed_up()
@@ -153,7 +151,7 @@ def _conclude(outcome: "Outcome", out: Path) -> int:
     stats = outcome.stats
     if not outcome.has_map:
         reason = stats["initialization_failure"]
-        typer.echo(f"no map: {reason} ({stats['processed_frames']} frames; see {out / 'stats.json'})", err=True)
+        typer.echo(f"no map: {reason} (see {out / 'stats.json'})", err=True)
         return EXIT_INTERRUPTED if outcome.record.interrupted else EXIT_NO_MAP
     typer.echo(
         f"{stats['tracked_frames']} of {stats['frames']} frames localised{_in_maps(stats['maps'])}, {stats['keyframes']} keyframes, "
@@ -168,8 +166,7 @@ def _conclude(outcome: "Outcome", out: Path) -> int:
             typer.echo(f"  {out / name}")
     for entry in stats["maps"][1:]:
         typer.echo(f"  {out / entry['folder']}: {entry['frames']} frames, {entry['keyframes']} keyframes, {entry['cloud_points']} points")
-    if stats["success_rate"] < LOW_SUCCESS and not outcome.record.interrupted:
-        typer.echo(_gaps_line(stats), err=True)
+    _tell_gaps(outcome)
     if outcome.record.interrupted:
         return EXIT_INTERRUPTED
     return _say_empty_meshes(stats["empty_meshes"])
@@ -179,10 +176,16 @@ def _in_maps(maps: list[dict[str, Any]]) -> str:
     return f" in {len(maps)} maps (largest: {maps[0]['frames']})" if len(maps) > 1 else ""
 
 
-def _gaps_line(stats: dict[str, Any]) -> str:
-    """A warning about the frames that are not localised; which and why comes from run_gaps."""
-    missing = stats["frames"] - stats["tracked_frames"]
-    return f"warning: {missing} of {stats['frames']} frames are not localised ({100 * (1 - stats['success_rate']):.0f} %)"
+def _tell_gaps(outcome: "Outcome") -> None:
+    """Which frames are not localised, and why; where they are many, as a warning with what to do."""
+    from vitamin3d.run_gaps import longest_told, warning
+
+    stats, gaps = outcome.stats, outcome.gaps
+    lines = [] if outcome.record.interrupted else warning(gaps, stats["tracked_frames"], stats["frames"], outcome.atlas.notes)
+    if lines:
+        typer.echo("\n  ".join([f"warning: {lines[0]}", *lines[1:]]), err=True)
+    elif gaps:
+        typer.echo("\n  ".join(["not localised:", *longest_told(gaps)]))
 
 
 def _say_empty_meshes(names: list[str]) -> int:

@@ -73,7 +73,7 @@ class Report:
     stats: str = ""
     settings: str = ""
     sections: Sequence[str] = ()
-    """HTML, before the view: `section_table`."""
+    """HTML, before the view: `section_table`, `section_text`."""
 
 
 def report_html(report: Report) -> str:
@@ -114,6 +114,11 @@ def section_table(title: str, heads: Sequence[str], rows: Sequence[Sequence[obje
         for line, kind in zip(lines, ["th", *["td"] * len(rows)], strict=True)
     )
     return f"<h2>{escape(title)}</h2><table>{cells}</table>"
+
+
+def section_text(title: str, text: str) -> str:
+    """A part of the page: a paragraph of plain text."""
+    return f"<h2>{escape(title)}</h2><p>{escape(text)}</p>"
 
 
 def _page(report: Report, triangles: int) -> str:

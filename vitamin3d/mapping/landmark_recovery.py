@@ -30,15 +30,19 @@ def _cut_patches(image, pixels, radius, out):  # type: ignore[no-untyped-def]
 
 
 @kernel
-def _zncc(a, b, out):  # type: ignore[no-untyped-def]
-    """Zero-mean normalised cross-correlation of patches (N, P) row by row; 0 where one has no contrast."""
+def _zncc(a, b, noise, out):  # type: ignore[no-untyped-def]
+    """Zero-mean normalised cross-correlation of patches (N, P) row by row; 0 where one has no contrast.
+
+    The variance of the noise is taken off those of the patches, half of each at most: it correlates with nothing.
+    """
     for i in range(a.shape[0]):
         n = a.shape[1]
         sa, sb, saa, sbb, sab = 0.0, 0.0, 0.0, 0.0, 0.0
         for k in range(n):
             x, y = float(a[i, k]), float(b[i, k])
             sa, sb, saa, sbb, sab = sa + x, sb + y, saa + x * x, sbb + y * y, sab + x * y
-        variance = (saa - sa * sa / n) * (sbb - sb * sb / n)
+        of_a, of_b, of_noise = saa - sa * sa / n, sbb - sb * sb / n, n * noise * noise
+        variance = max(of_a - of_noise, 0.5 * of_a) * max(of_b - of_noise, 0.5 * of_b)
         out[i] = (sab - sa * sb / n) / np.sqrt(variance) if variance > 1e-6 else 0.0
 
 
@@ -62,10 +66,10 @@ def cut_patches(image: Array, pixels: Array) -> Array:
     return out
 
 
-def patch_similarity(a: Array, b: Array) -> Array:
-    """Zero-mean normalised cross-correlation (N,) of patches (N, P) uint8, in [-1, 1]."""
+def patch_similarity(a: Array, b: Array, noise: float = 0.0) -> Array:
+    """Zero-mean normalised cross-correlation (N,) of patches (N, P) uint8, in [-1, 1] but for noise of this deviation, grey levels."""
     out = np.empty(len(a))
-    _zncc(a, b, out)
+    _zncc(a, b, noise, out)
     return out
 
 
@@ -120,7 +124,7 @@ def _visible_candidates(sparse_map: SparseMap, live_ids: Array, T_cam_world: Arr
 
 def recover_landmarks(
     tracks: Tracks, sparse_map: SparseMap, image: Array, kappa: Array, image_motion: Array, T_cam_world: Array, camera: Camera,
-    config: RecoveryConfig,
+    config: RecoveryConfig, noise: float = 0.0,
 ) -> tuple[Tracks, Array]:  # fmt: skip
     """The tracks with those landmarks added that came back into view, and the ids (N, 2) of landmarks that met tracked ones there.
 
@@ -132,6 +136,7 @@ def recover_landmarks(
         kappa: (H, W) float32 of the frame.
         image_motion: (6, 2) of the frame.
         T_cam_world: (4, 4) of the frame.
+        noise: deviation of the picture's noise, grey levels.
     """
     ids = _visible_candidates(sparse_map, tracks.ids, T_cam_world, camera, config)
     points = sparse_map.points_world.take(ids, axis=0)
@@ -142,7 +147,7 @@ def recover_landmarks(
     pixels, found = np.empty_like(predicted), np.empty(len(predicted), np.bool_)
     _climb_strict(kappa, predicted, int(config.gate_px) + 2, config.gate_px, pixels, found)
     ids, pixels = ids[found], pixels[found]
-    agrees = patch_similarity(sparse_map.patches[ids], cut_patches(image, pixels)) > config.min_zncc
+    agrees = patch_similarity(sparse_map.patches[ids], cut_patches(image, pixels), noise) > config.min_zncc
     ids, pixels = ids[agrees], pixels[agrees]
     return _take_up(tracks, sparse_map.is_mapped(tracks.ids), ids, pixels, kappa)
 

@@ -160,7 +160,7 @@ def _judged(T: Array, points_world: Array, pixels: Array, camera: Camera, config
 
 
 def voters(num_observations: Array, config: LocalizationConfig) -> Array:
-    """(N,) bool: which landmarks, by their observations in keyframes (N,), localise the camera; where few have many, those with fewer too."""
+    """(N,) bool: which landmarks, by their observations in keyframes (N,), localise the camera; where few have many, the next too."""
     votes = config.votes
     while votes > 2 and (num_observations >= votes).sum() < config.min_voters:
         votes //= 2

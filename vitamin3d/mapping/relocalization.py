@@ -63,7 +63,7 @@ class RememberedKeyframes:
         chosen = newest_first[:count]
         if num_lost >= self.config.tries_at_once:
             others = newest_first[count:] or chosen
-            begin = (num_lost // self.config.interval * (count - 1)) % len(others)
+            begin = (num_lost // self.config.interval * (count - 1)) % max(1, len(others))
             chosen = newest_first[:1] + (others + others)[begin : begin + count - 1]
         return [(k, self._described(k)) for k in dict.fromkeys(chosen)]
 

@@ -61,5 +61,5 @@ def _judged(view: TwoView, config: InitializationConfig) -> InitializationAttemp
         return InitializationAttempt(None, f"no parallax: {parallax:.2f}° in the median, the camera turns but does not travel", parallax)
     if good.sum() < max(config.min_tracks, config.min_triangulated_ratio * view.is_inlier.sum()):
         reason = f"only {int(good.sum())} of {int(view.is_inlier.sum())} tracks lie in front of both cameras"
-        return InitializationAttempt(None, reason, is_retry=True)
-    return InitializationAttempt(view, "")
+        return InitializationAttempt(None, reason, parallax, is_retry=True)
+    return InitializationAttempt(view, "", parallax)

@@ -50,7 +50,7 @@ def view_of(index: int, picture: Array, config: ContinuityConfig) -> View:
 
 
 def correlation(a: Array, b: Array, flow: Array) -> float:
-    """Zero-mean normalised cross-correlation of grid a (h, w) with grid b moved back by a flow (H, W, 2) in pixels of its own; 0 for none."""
+    """Zero-mean normalised cross-correlation of grid a (h, w) with grid b moved back by a flow (H, W, 2), where both are there; else 0."""
     height, width = a.shape
     coarse = cv2.resize(flow, (width, height), interpolation=cv2.INTER_AREA) * np.float32(width / flow.shape[1])
     u, v = np.meshgrid(np.arange(width, dtype=np.float32), np.arange(height, dtype=np.float32))
@@ -108,7 +108,7 @@ class FlowTracker:
             if candidate is not None and found is not None and found.correlation >= self.config.min_correlation:
                 self._forget_break(candidate, view.index)
                 return found.flow, candidate.index
-        if earlier is None or view.index - earlier.index > self.config.max_gap:
+        if earlier is None or earlier.contrast < self.config.min_contrast or view.index - earlier.index > self.config.max_gap:
             self._before_break = previous
         return None, None
 

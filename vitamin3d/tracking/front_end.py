@@ -11,16 +11,18 @@ from vitamin3d.tracking.continuity import FlowTracker
 from vitamin3d.tracking.curvature import curvature
 from vitamin3d.tracking.dominant_flow import CoarseFeatures, coarse_features, estimate_dominant_flow
 from vitamin3d.tracking.extrema import detect_extrema
-from vitamin3d.tracking.noise_floor import curvature_floor, lowest_floor
+from vitamin3d.tracking.noise_floor import curvature_floor, lowest_floor, noise_deviation, smoothing_for
 from vitamin3d.types import Array, DominantFlow, Frame, FrontEndFrame, StepTimes
 
 DESCENT_ITERATIONS = 8
+NOISE_MEMORY = 0.9
+"""The blur follows the noise of many pictures: extrema move with it."""
 IDENTITY_FLOW = DominantFlow(np.eye(2), np.zeros(2), 0.0)
 
 
 def dense_flow_solver(config: Config) -> cv2.DISOpticalFlow:
     """OpenCV's DIS at the settings' size."""
-    dis = cv2.DISOpticalFlow_create(cv2.DISOPTICAL_FLOW_PRESET_ULTRAFAST)  # type: ignore[attr-defined]
+    dis: cv2.DISOpticalFlow = cv2.DISOpticalFlow_create(cv2.DISOPTICAL_FLOW_PRESET_ULTRAFAST)  # type: ignore[attr-defined]
     dis.setFinestScale(max(0, config.extrema_tracking.flow_octave - round(float(np.log2(config.extrema_tracking.flow_reduction)))))
     dis.setGradientDescentIterations(DESCENT_ITERATIONS)
     return dis
@@ -36,6 +38,7 @@ class FrontEnd:
         self._features: CoarseFeatures | None = None
         self._dominant_flow = IDENTITY_FLOW
         self._previous: int | None = None
+        self._noise: float | None = None
 
     def process(self, frame: Frame) -> FrontEndFrame:
         """Curvature (Eq. 1), its maxima (Sec. 2.1) and the flow since the frame that it continues (Sec. 2.2)."""
@@ -48,14 +51,18 @@ class FrontEnd:
             else:
                 self._update_dominant_flow(frame.image)
         self._previous = frame.index
-        return FrontEndFrame(frame, kappa, extrema, self._dominant_flow, flow, follows)
+        return FrontEndFrame(frame, kappa, extrema, self._dominant_flow, flow, follows, self._noise or 0.0)
 
     def _extrema(self, image: Array) -> tuple[Array, Array]:
         """Curvature in the unit of its floor, and the maxima above that, strongest first."""
-        config, kappa = self.config.extrema, curvature(image, self.config.curvature)
+        config = self.config.extrema
         if config.wanted == 0:
+            kappa = curvature(image, self.config.curvature)
             return kappa, detect_extrema(kappa, config)
-        lowest = lowest_floor(image, self.config.curvature.smoothing_sigma_px, config)
+        noise = noise_deviation(image)
+        self._noise = noise if self._noise is None else NOISE_MEMORY * self._noise + (1.0 - NOISE_MEMORY) * noise
+        smoothing = smoothing_for(self._noise, self.config.curvature)
+        kappa, lowest = curvature(image, smoothing), lowest_floor(noise, smoothing.smoothing_sigma_px, config)
         extrema = detect_extrema(kappa, replace(config, min_curvature=lowest))
         strengths = kappa[extrema[:, 1], extrema[:, 0]]
         floor = curvature_floor(strengths, lowest, config)

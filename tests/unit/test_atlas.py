@@ -1,0 +1,211 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The maps of a run: cuts, black pictures, false starts, and what is kept of them."""
+
+import dataclasses
+
+import cv2
+import numpy as np
+import pytest
+
+from vitamin3d.atlas import Atlas
+from vitamin3d.config import AtlasConfig, Config
+from vitamin3d.geometry.camera import Camera
+from vitamin3d.geometry.sim3_alignment import align_sim3
+from vitamin3d.mapping.window_adjustment import AdjustAtOnce
+from vitamin3d.slam import IDS_PER_MAP
+from vitamin3d.tracking.front_end import FrontEnd
+from vitamin3d.types import Frame, SlamState
+
+PERIOD_NS = 50_000_000
+UNLOCALISED = (SlamState.INITIALIZING, SlamState.ROTATING, SlamState.LOST)
+
+
+def track(demo, pictures, config=None, start_ns=10**18):
+    """An atlas of a film, and after each frame its state and the tracks' ids as they were born."""
+    config = config or Config()
+    front_end, atlas, ids = FrontEnd(config), Atlas(demo.camera, config), []
+    for index, picture in enumerate(pictures):
+        state = atlas.process_frame(front_end.process(Frame(index, start_ns + index * PERIOD_NS, picture)))
+        assert state is atlas.notes[-1].state
+        ids.append(atlas.current.unique_ids(atlas.current.tracks.ids))
+    return atlas, ids
+
+
+def frames_of(slam, count):
+    return [index for index in range(count) if index in slam.poses]
+
+
+def path_error(slam, demo, sources):
+    """RMSE of the centres after Sim(3), metres; frame n of the film is a frame of the demo."""
+    path, truth = slam.trajectory(), demo.ground_truth()
+    a, b = path.T_world_cam[:, :3, 3], truth.T_world_cam[[sources[k] for k in frames_of(slam, len(sources))], :3, 3]
+    s, R, t = align_sim3(a, b)
+    return np.sqrt(((s * a @ R.T + t - b) ** 2).sum(axis=1).mean())
+
+
+@pytest.fixture(scope="module")
+def plain(demo):
+    return [demo.read(index).image for index in range(150)]
+
+
+@pytest.fixture(scope="module")
+def flipped(plain):
+    return [cv2.flip(picture, -1) for picture in plain]
+
+
+@pytest.fixture(scope="module")
+def cut(demo, plain, flipped):
+    return track(demo, plain[:70] + flipped[70:])
+
+
+# --- a cut -----------------------------------------------------------------------------------------------------------
+
+
+def test_a_cut_film_has_two_maps_one_after_the_other(demo, cut):
+    atlas, _ = cut
+    later, earlier = atlas.ranked()
+    assert (earlier.number, later.number) == (0, 1) and atlas.left == [earlier] and atlas.active is atlas.current is later
+    assert len(frames_of(earlier, 150)) >= 69 and len(frames_of(later, 150)) >= 79
+    assert max(frames_of(earlier, 150)) <= 69 < 70 <= min(frames_of(later, 150))
+    assert max(path_error(slam, demo, range(150)) for slam in (earlier, later)) < 0.01
+    assert earlier.map.num_keyframes >= 5 and later.map.num_keyframes >= 5
+    assert earlier.map.frame_indices[-1] < 70 <= later.map.frame_indices[0]
+
+
+def test_each_frame_has_its_note(cut):
+    notes = cut[0].notes
+    assert [note.index for note in notes] == list(range(150))
+    assert [note.timestamp_ns for note in notes] == [10**18 + k * PERIOD_NS for k in range(150)]
+    assert [note.index for note in notes if not note.continues] == [0, 70]
+    assert all(note.state in UNLOCALISED for note in (*notes[:5], *notes[70:75]))
+    assert all(note.state is SlamState.TRACKING for note in (*notes[40:70], *notes[110:]))
+    assert {note.map_number for note in notes[:70]} == {0} and {note.map_number for note in notes[70:]} == {1}
+    assert all(note.reason for note in notes if note.state is SlamState.INITIALIZING) and not any(n.reason for n in notes[40:70])
+    assert all(note.num_extrema > 500 and note.num_tracks > 500 and note.contrast > 20 and 50 < note.brightness < 200 for note in notes)
+    assert all((note.motion_px > 0) == note.continues and note.motion_px < 30 for note in notes)
+
+
+def test_tracks_of_two_maps_never_share_an_id(cut):
+    atlas, ids = cut
+    before, after = np.unique(np.concatenate(ids[:70])), np.unique(np.concatenate(ids[70:]))
+    assert len(before) > 3000 and len(after) > 3000 and len(np.intersect1d(before, after)) == 0
+    assert before.max() < IDS_PER_MAP <= after.min() and after.max() < 2 * IDS_PER_MAP
+
+
+def test_keyframes_come_with_their_map_and_once(demo, plain, flipped):
+    front_end, atlas, taken = FrontEnd(Config()), Atlas(demo.camera, Config()), []
+    for index, picture in enumerate(plain[:70] + flipped[70:]):
+        atlas.process_frame(front_end.process(Frame(index, index * PERIOD_NS, picture)))
+        taken += atlas.take_settled_keyframes()
+    taken += atlas.take_settled_keyframes(everything=True)
+    keys = [(slam.number, keyframe) for slam, keyframe, _ in taken]
+    assert sorted(keys) == [(slam.number, k) for slam in atlas.ranked()[::-1] for k in range(slam.map.num_keyframes)]
+    assert all(slam.map.frame_indices[keyframe] == frame.index for slam, keyframe, frame in taken)
+    numbers = [slam.snapshot(keyframe, frame).map_number for slam, keyframe, frame in (taken[0], taken[-1])]
+    assert numbers == [0, 1] and atlas.take_settled_keyframes(everything=True) == []
+
+
+def test_the_same_film_gives_the_same_maps(demo, plain, flipped, cut):
+    again, ids = track(demo, plain[:70] + flipped[70:])
+    for a, b in zip(cut[0].ranked(), again.ranked(), strict=True):
+        pairs = (a.trajectory().T_world_cam, b.trajectory().T_world_cam), (a.map.points_world, b.map.points_world)
+        assert all(x.tobytes() == y.tobytes() for x, y in pairs) and a.camera == b.camera
+        assert a.map.frame_indices == b.map.frame_indices and a.map.obs_pixels.tobytes() == b.map.obs_pixels.tobytes()
+    assert cut[0].notes == again.notes
+    assert all(np.array_equal(x, y) for x, y in zip(cut[1], ids, strict=True))
+
+
+# --- breaks that are survived ----------------------------------------------------------------------------------------
+
+
+@pytest.fixture(scope="module")
+def dark(demo, plain):
+    """A covered lens: one second, while the camera stands still."""
+    return track(demo, plain[:60] + [np.zeros_like(plain[0])] * 20 + plain[60:])
+
+
+def test_a_black_second_is_within_one_map(demo, dark):
+    atlas, _ = dark
+    (slam,) = atlas.ranked()
+    assert slam.number == 0 and frames_of(slam, 170) == [*range(60), *range(80, 170)]
+    assert path_error(slam, demo, [*range(60), *[0] * 20, *range(60, 150)]) < 0.01
+    assert atlas.successor is None and atlas.left == [] and atlas.active is slam
+
+
+def test_notes_tell_that_the_pictures_were_black(dark):
+    notes = dark[0].notes
+    black = notes[60:80]
+    assert all(note.contrast == note.brightness == note.motion_px == note.num_extrema == note.num_tracks == 0 for note in black)
+    assert not any(note.continues or note.state in (SlamState.TRACKING, SlamState.UNCERTAIN) for note in black)
+    assert all(note.continues and note.state is SlamState.TRACKING and note.map_number == 0 for note in notes[80:])
+
+
+def test_a_stray_picture_costs_its_own_frame_alone(demo, plain):
+    stray = demo.read(149).image[::-1].copy()  # mirrored: no rotation brings it about
+    atlas, ids = track(demo, [*plain[:60], stray, *plain[60:90]])
+    (slam,) = atlas.ranked()
+    assert frames_of(slam, 91) == [*range(60), *range(61, 91)]
+    assert len(np.intersect1d(ids[59], ids[61])) > 0.7 * len(ids[59])  # the tracks live on
+
+
+def test_a_false_start_is_left_behind(demo, plain, flipped):
+    atlas, _ = track(demo, flipped[110:140] + plain)
+    largest = atlas.ranked()[0]
+    found = frames_of(largest, 180)
+    assert sum(index >= 30 for index in found) >= 140 and path_error(largest, demo, [*range(110, 140), *range(150)]) < 0.01
+    assert len(atlas.notes) == 180
+
+
+def test_a_map_that_is_lost_young_is_dropped_or_kept_as_the_settings_say(demo, plain, flipped):
+    film = plain[:33] + flipped[110:]
+    assert [slam.number for slam in track(demo, film)[0].ranked()] == [1]
+    patient = dataclasses.replace(Config(), atlas=AtlasConfig(min_keyframes=2, min_frames=2))
+    atlas, _ = track(demo, film, patient)
+    assert [slam.number for slam in atlas.ranked()] == [1, 0] and max(frames_of(atlas.ranked()[1], 73)) == 32
+
+
+def test_nothing_but_black_or_one_picture_is_no_map(demo, plain):
+    for pictures in ([np.zeros_like(plain[0])] * 12, [plain[0]] * 12, []):
+        atlas, _ = track(demo, pictures)
+        assert atlas.ranked() == [] and len(atlas.notes) == len(pictures) and atlas.adjustments_awaited == 0
+        atlas.finish()
+        assert atlas.take_settled_keyframes(everything=True) == []
+
+
+# --- what maps share -------------------------------------------------------------------------------------------------
+
+
+def test_the_next_map_begins_with_the_refined_camera(demo, plain, flipped):
+    eager = dataclasses.replace(Config(), calibration=dataclasses.replace(Config().calibration, refine="on", first_keyframes=6))
+    wrong = dataclasses.replace(demo.camera, fx=1.02 * demo.camera.fx, fy=1.02 * demo.camera.fy)
+    assert isinstance(wrong, Camera)
+    front_end, atlas = FrontEnd(eager), Atlas(wrong, eager)
+    for index, picture in enumerate(plain[:80] + flipped[80:83]):
+        atlas.process_frame(front_end.process(Frame(index, index * PERIOD_NS, picture)))
+    first, second = atlas.active, atlas.successor
+    assert first.number == 0 and first.map.num_keyframes and first.camera != wrong and second.number == 1
+    assert second.camera == first.camera and second.calibration.given == wrong and second.calibration.history == []
+    assert second.calibration._reads_at_once == first.calibration._reads_at_once
+
+
+def test_all_maps_have_one_adjuster(demo, plain, flipped):
+    atlas, adjuster = Atlas(demo.camera, Config()), AdjustAtOnce()
+    atlas.use_adjuster(adjuster)
+    front_end = FrontEnd(Config())
+    for index, picture in enumerate(plain[:70] + flipped[70:72]):
+        atlas.process_frame(front_end.process(Frame(index, index * PERIOD_NS, picture)))
+    assert atlas.successor is not None and all(slam.adjuster is adjuster for slam in (atlas.active, atlas.successor))
+    assert atlas.successor.times is atlas.active.times is atlas.times
+
+
+def test_the_image_moves_since_the_frame_before_and_not_since_the_epoch(demo, plain, flipped):
+    """Which matters for a rolling shutter: after the first frame, and after a cut."""
+    rolling = dataclasses.replace(demo.camera, readout_s=0.02)
+    front_end, atlas, speeds = FrontEnd(Config()), Atlas(rolling, Config()), []
+    for index, picture in enumerate(plain[:40] + flipped[40:44]):
+        atlas.process_frame(front_end.process(Frame(index, 10**18 + index * PERIOD_NS, picture)))
+        speeds.append(np.linalg.norm(atlas.current._image_motion[0]))
+    pixels_per_second = np.array([note.motion_px for note in atlas.notes]) / (1e-9 * PERIOD_NS)
+    assert (pixels_per_second[1:3] > 10).all() and speeds[0] == speeds[40] == 0.0
+    for k in (1, 2, 20, 41, 42, 43):
+        assert 0.3 * pixels_per_second[k] < speeds[k] < 3 * pixels_per_second[k], k
