@@ -37,6 +37,7 @@ INGREDIENTS: tuple[tuple[str, str, Any], ...] = (
     ("dense flow prediction", "extrema_tracking.gate_px", 8.0),
     ("coasting", "extrema_tracking.coast_frames", 0),
     ("weak extrema", "extrema.min_curvature", 0.3),
+    ("weak extrema", "extrema.wanted", 0),
     ("round extrema", "extrema.min_roundness", 0.0),
     ("round extrema", "extrema_tracking.min_roundness", 0.0),
     ("smoothing", "curvature.smoothing_sigma_px", 0.0),

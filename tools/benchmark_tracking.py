@@ -50,6 +50,7 @@ class Tracker:
         self.config, self.front_end = config, FrontEnd(config)
         self.tracks, self.times = Tracks.empty(), StepTimes()
         self._next_id = self._frame_count = 0
+        self._newest: int | None = None
 
     def process(self, frame: Frame) -> None:
         """One frame: curvature, extrema, flow; predict and climb; every few frames refill."""
@@ -66,6 +67,9 @@ class Tracker:
         self.times.add("total", time.thread_time() - start)
 
     def _tracked(self, front: FrontEndFrame) -> Tracks:
+        newest, self._newest = self._newest, front.frame.index
+        if front.follows != newest:
+            return Tracks.empty()
         if front.dense_flow is not None:
             predicted = predict_by_dense_flow(self.tracks.pixels, front.dense_flow, self.config.extrema_tracking.flow_reduction)
         else:

@@ -23,7 +23,7 @@ from vitamin3d.mapping.visible_landmarks import with_unobserved
 from vitamin3d.slam import Slam
 from vitamin3d.tracking.extrema_tracking import predict_by_dense_flow
 from vitamin3d.tracking.front_end import FrontEnd
-from vitamin3d.types import Array, FrontEndFrame
+from vitamin3d.types import Array, FrontEndFrame, Tracks
 
 STAGES = (
     "detected",
@@ -59,8 +59,8 @@ class FunnelSlam(Slam):
         self.ever_mapped: set[int] = set()
         self.frames_seen: Counter[int] = Counter()
         self.second_lives = 0
-        """Landmarks found again after their track had ended."""
-        self._known = self.tracks.ids
+        """Landmarks found again after their track had ended, tracks that go on after another picture came between."""
+        self._known, self._before = self.tracks.ids, self.tracks
 
     def _account(self, reason: str) -> int:
         """Books the tracks that are gone since the last time under a reason; how many."""
@@ -76,9 +76,18 @@ class FunnelSlam(Slam):
         self.ever_mapped.update(seen[self.map.is_mapped(seen)].tolist())
         return state
 
+    def _resume(self, followed: int | None) -> bool:
+        is_resumed = super()._resume(followed)
+        self._before = self.tracks if is_resumed else Tracks.empty()
+        self.ends[REASONS[7]] += len(np.setdiff1d(self._known, self._before.ids))
+        self.second_lives += len(np.setdiff1d(self._before.ids, self._known))
+        self._known = self._before.ids
+        return is_resumed
+
     def _track(self, front: FrontEndFrame):  # type: ignore[no-untyped-def]
-        before, config = self.tracks, self.config.extrema_tracking
+        self._before, config = self.tracks, self.config.extrema_tracking
         self.tracks = super()._track(front)
+        before = self._before
         lost = ~np.isin(before.ids, self.tracks.ids)
         predicted = before.pixels
         if front.dense_flow is not None:

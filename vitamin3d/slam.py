@@ -40,7 +40,7 @@ from vitamin3d.types import Array, Frame, FrontEndFrame, Localization, MapSnapsh
 
 IDS_PER_MAP = 1 << 40
 """Tracks of different maps have different ids."""
-UNTAKEN_WINDOWS, UNTAKEN_KEYFRAMES = 2, 30
+UNTAKEN_WINDOWS, UNTAKEN_KEYFRAMES = 2, 16
 """Pictures of keyframes that nobody takes are kept for so many windows, or keyframes where that is more."""
 
 
@@ -129,8 +129,10 @@ class Slam:
         index, tracks, last_ns = self._before_break
         if followed is not None and followed == index:
             self.tracks, self._last_ns = tracks, last_ns
+            self._before_break = -1, Tracks.empty(), 0
             return True
-        if followed is None and len(self.tracks):
+        is_over = index < 0 or self._newest_frame - index > self.config.continuity.max_gap
+        if followed is None and len(self.tracks) and is_over:
             self._before_break = self._newest_frame, self.tracks, self._last_ns
         return False
 
@@ -240,7 +242,7 @@ class Slam:
         self._end_tracks(ids[~found.is_inlier])
         if self._is_loose(ids[found.is_inlier]):
             return self._wait(front, found.T_cam_world)
-        self.state = SlamState.TRACKING
+        self.state, self._num_doubts = SlamState.TRACKING, 0
         self._turned_frames.clear()
         recovery = self.config.recovery
         if recovery.enabled and self._frame_count % recovery.interval == 0 and self._recover(front, found.T_cam_world):

@@ -86,7 +86,7 @@ def test_each_frame_has_its_note(cut):
 
 
 def test_tracks_of_two_maps_never_share_an_id(cut):
-    atlas, ids = cut
+    _, ids = cut
     before, after = np.unique(np.concatenate(ids[:70])), np.unique(np.concatenate(ids[70:]))
     assert len(before) > 3000 and len(after) > 3000 and len(np.intersect1d(before, after)) == 0
     assert before.max() < IDS_PER_MAP <= after.min() and after.max() < 2 * IDS_PER_MAP
@@ -140,12 +140,13 @@ def test_notes_tell_that_the_pictures_were_black(dark):
     assert all(note.continues and note.state is SlamState.TRACKING and note.map_number == 0 for note in notes[80:])
 
 
-def test_a_stray_picture_costs_its_own_frame_alone(demo, plain):
-    stray = demo.read(149).image[::-1].copy()  # mirrored: no rotation brings it about
-    atlas, ids = track(demo, [*plain[:60], stray, *plain[60:90]])
+@pytest.mark.parametrize("sources", [[149], [149, 20], [149, 20, 90, 90]])
+def test_stray_pictures_cost_their_own_frames_alone(demo, plain, sources):
+    strays, count = [plain[k][::-1].copy() for k in sources], len(sources)  # mirrored: no rotation brings it about
+    atlas, ids = track(demo, [*plain[:60], *strays, *plain[60:90]])
     (slam,) = atlas.ranked()
-    assert frames_of(slam, 91) == [*range(60), *range(61, 91)]
-    assert len(np.intersect1d(ids[59], ids[61])) > 0.7 * len(ids[59])  # the tracks live on
+    assert frames_of(slam, 90 + count) == [*range(60), *range(60 + count, 90 + count)]
+    assert len(np.intersect1d(ids[59], ids[60 + count])) > 0.7 * len(ids[59])  # the tracks live on
 
 
 def test_a_false_start_is_left_behind(demo, plain, flipped):
@@ -170,6 +171,22 @@ def test_nothing_but_black_or_one_picture_is_no_map(demo, plain):
         assert atlas.ranked() == [] and len(atlas.notes) == len(pictures) and atlas.adjustments_awaited == 0
         atlas.finish()
         assert atlas.take_settled_keyframes(everything=True) == []
+
+
+# --- poses that hang on little ---------------------------------------------------------------------------------------
+
+
+def test_a_pose_without_known_landmarks_adds_nothing_to_the_map(demo, plain):
+    """For so many frames in a row; then the camera is looked for."""
+    doubting = dataclasses.replace(Config(), localization=dataclasses.replace(Config().localization, min_known=10**6))
+    atlas, _ = track(demo, plain[:90], doubting)
+    slam = atlas.active
+    states = [note.state for note in atlas.notes]
+    first, most = states.index(SlamState.UNCERTAIN), doubting.localization.max_loose_frames
+    assert not any(states[index] is SlamState.UNCERTAIN for index in slam.map.frame_indices)
+    assert slam.map.frame_indices[2 * doubting.localization.loose_observations - 1] < first  # a young map does not know better
+    assert states[first : first + most + 1] == [SlamState.UNCERTAIN] * most + [SlamState.TRACKING]  # found again at once
+    assert frames_of(slam, 90) == list(range(90)) and path_error(slam, demo, range(90)) < 0.01
 
 
 # --- what maps share -------------------------------------------------------------------------------------------------

@@ -1,4 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
+import dataclasses
 import importlib.util
 from pathlib import Path
 
@@ -7,6 +8,7 @@ import pytest
 from scenes import DEMO
 
 from vitamin3d.config import Config
+from vitamin3d.tracking.front_end import FrontEnd
 
 _SPEC = importlib.util.spec_from_file_location("landmark_funnel", Path(__file__).parents[2] / "tools" / "landmark_funnel.py")
 funnel = importlib.util.module_from_spec(_SPEC)
@@ -29,6 +31,20 @@ def test_every_track_that_is_no_more_has_a_reason(slam):
     assert sum(slam.ends.values()) == slam._next_id + slam.second_lives - len(slam.tracks) and slam.second_lives > 0
     assert slam.ends[REASONS[1]] > slam.ends[REASONS[7]] == 0
     assert 200 < funnel.good_per_keyframe(slam) <= funnel.visible_per_keyframe(slam)
+
+
+def test_breaks_of_the_picture_are_accounted_for(demo):
+    """A mirrored picture, and a film that is mirrored from one on."""
+    front_end, slam = FrontEnd(Config()), funnel.FunnelSlam(demo.camera, Config())
+    sources = [*range(34), -34, *range(35, 45), *range(-60, -46)]
+    for index, source in enumerate(sources):
+        frame = demo.read(abs(source))
+        image = frame.image[:, ::-1].copy() if source < 0 else frame.image
+        slam.process_frame(front_end.process(dataclasses.replace(frame, index=index, image=image)))
+        live, begun, jumped = len(slam.tracks), slam._next_id + slam.second_lives, slam.ends[REASONS[7]]
+        assert sum(slam.ends.values()) == begun - live, index
+        assert (jumped > 0) == (index >= 34)
+    assert slam.second_lives > 1000
 
 
 def test_the_table_is_printed_and_written(tmp_path: Path, capsys):

@@ -323,6 +323,18 @@ def test_similarity_is_the_correlation_coefficient(rng):
     np.testing.assert_array_equal(patch_similarity(np.full((2, 81), 9, np.uint8), a[:2]), 0.0)
 
 
+def test_noise_is_taken_off_the_contrast_of_patches(rng):
+    clean = 10.0 * rng.standard_normal((500, 81)) + 128
+    a, b = (np.clip(clean + 8.0 * rng.standard_normal(clean.shape), 0, 255).astype(np.uint8) for _ in range(2))
+    x, y = (patches - patches.mean(axis=1, keepdims=True) for patches in (a.astype(float), b.astype(float)))
+    for noise in (0.0, 5.0, 8.0, 200.0):
+        of_x, of_y = (np.maximum((z**2).sum(axis=1) - 81 * noise**2, 0.5 * (z**2).sum(axis=1)) for z in (x, y))
+        np.testing.assert_allclose(patch_similarity(a, b, noise), (x * y).sum(axis=1) / np.sqrt(of_x * of_y), atol=1e-10)
+    assert patch_similarity(a, b).mean() < 0.7 and 0.9 < patch_similarity(a, b, 8.0).mean() < 1.1
+    others = patch_similarity(a, b[::-1].copy(), 8.0)
+    assert abs(others.mean()) < 0.02 and (others < 0.6).mean() > 0.99
+
+
 def test_strict_climbing_equals_its_twin(rng):
     kappa = rng.standard_normal((30, 40)).astype(np.float32)
     predicted = rng.uniform(3, [36, 26], (150, 2))

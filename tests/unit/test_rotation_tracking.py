@@ -66,6 +66,13 @@ def test_without_noise_it_is_exact(rng):
     np.testing.assert_allclose(turn.R_cam_world, R, atol=1e-9)
 
 
+def test_tracks_on_one_line_give_a_rotation_and_no_mirror(rng):
+    for _ in range(20):
+        R, pixels = rotation(*rng.uniform(-9, 9, 3)), np.column_stack([rng.uniform(0, 640, 80), np.full(80, PINHOLE.cy)])
+        turn = rotation_of(unit_rays(pixels, PINHOLE) @ R, pixels, np.arange(80), np.eye(3), PINHOLE, CONFIG)
+        np.testing.assert_allclose(turn.R_cam_world, R, atol=1e-9)
+
+
 def test_too_few_tracks_tell_nothing(rng):
     directions, pixels, _ = sky(rng, np.eye(3), 60)
     ages = np.ones(60, int)
@@ -173,20 +180,24 @@ def test_directions_follow_new_ids(rng):
 # --- chains of turns -------------------------------------------------------------------------------------------------
 
 
+def turned(k, step_deg=2.0):
+    return rotation(0.3 * step_deg * k, step_deg * k, 0.0)
+
+
 def chain(count=6, step_deg=2.0):
     turns = Turns()
     for k in range(count):
-        turns.add(frame(10 + k), rotation(0.0, step_deg * k, 0.0))
+        turns.add(frame(10 + k), turned(k, step_deg))
     return turns
 
 
 def test_a_chain_gives_the_poses_relative_to_the_reference():
     turns = chain()
-    np.testing.assert_array_equal(turns.newest, rotation(0.0, 10.0, 0.0))
+    np.testing.assert_array_equal(turns.newest, turned(5))
     pairs = turns.since(12)
     assert [kept.index for kept, _ in pairs] == [10, 11, 12, 13, 14, 15]
     for kept, T in pairs:
-        np.testing.assert_allclose(T[:3, :3], rotation(0.0, 2.0 * (kept.index - 12), 0.0), atol=1e-12)
+        np.testing.assert_allclose(T[:3, :3] @ turned(2), turned(kept.index - 10), atol=1e-12)
         np.testing.assert_array_equal(T[:, 3], [0, 0, 0, 1])
         assert kept.timestamp_ns == 50 * kept.index and kept.image.size == 0 and kept.color is None
     assert turns.since(9) == turns.since(16) == Turns().since(0) == []

@@ -110,8 +110,9 @@ def relocalize(
     """Pose of a frame from nothing but the map and the described corners of some keyframes; `converged` False where it is not found."""
     corners = described_corners(frame.image, config.corners)
     found = [landmark_matches(corners, k, described, sparse_map, camera, config) for k, described in keyframes]
-    ids = np.concatenate([np.zeros(0, np.int64), *(pair[0] for pair in found)])
-    pixels = camera.undistort(np.concatenate([np.zeros((0, 2)), *(corners[0][pair[1]] for pair in found)]))
+    pairs = np.concatenate([np.zeros((0, 2), np.int64), *(np.column_stack(pair) for pair in found)])
+    ids, rows = np.unique(pairs, axis=0).T  # what several keyframes say counts once
+    pixels = camera.undistort(corners[0][rows])
     valid = np.isfinite(pixels[:, 0])
     return localize(sparse_map.points_world[ids[valid]], pixels[valid], None, camera, localization, frame.index)
 

@@ -11,11 +11,11 @@ import numpy as np
 
 from vitamin3d.config import RotationConfig
 from vitamin3d.geometry.camera import Camera
+from vitamin3d.geometry.rotation_fit import fit_rotation, turned_by
 from vitamin3d.mapping.sparse_map import GrowingArray
 from vitamin3d.types import Array, Frame
 
 INLIER_SIGMAS = 3.0
-ITERATIONS = 12
 
 
 class Directions:
@@ -105,20 +105,14 @@ def rotation_of(directions: Array, pixels: Array, ages: Array, R_before: Array, 
     """R_cam_world (3, 3) that turns directions (N, 3) in the world to ideal pixels (N, 2); None where too few agree on one.
 
     The older half of the tracks, by their ages (N,), shows parallax first.
-    Weighted Kabsch with Geman–McClure weights, the scale annealed from what the rotation before leaves to that of the settings.
     """
     known = np.isfinite(directions[:, 0])
     directions, rays, ages = directions[known], unit_rays(pixels[known], camera), ages[known]
     if len(rays) < config.min_tracks or not config.enabled:
         return None
-    sigma, scale, R = config.sigma_px / camera.fx, np.inf, R_before
-    for _ in range(ITERATIONS):
-        squared = ((directions @ R.T - rays) ** 2).sum(axis=1)
-        scale = max(sigma, min(0.6 * scale, 1.5 * float(np.sqrt(np.median(squared)))))
-        weights = (scale**2 / (squared + scale**2)) ** 2
-        U, _, Vt = np.linalg.svd((rays * weights[:, None]).T @ directions)
-        R = U @ np.diag([1.0, 1.0, np.linalg.det(U @ Vt)]) @ Vt
-    agrees = ((directions @ R.T - rays) ** 2).sum(axis=1) < (INLIER_SIGMAS * sigma) ** 2
+    sigma = config.sigma_px / camera.fx
+    R = fit_rotation(directions, rays, R_before, sigma)
+    agrees = turned_by(directions, rays, R) < INLIER_SIGMAS * sigma
     is_old = ages >= np.median(ages)
     enough = agrees.sum() >= config.min_tracks and agrees.mean() >= config.min_share
-    return Turn(np.asarray(R), bool(agrees[is_old].mean() < config.min_old_share * agrees.mean())) if enough else None
+    return Turn(R, bool(agrees[is_old].mean() < config.min_old_share * agrees.mean())) if enough else None

@@ -11,6 +11,7 @@ import numpy as np
 from vitamin3d.config import InitializationConfig
 from vitamin3d.geometry.camera import Camera
 from vitamin3d.geometry.essential import relative_pose
+from vitamin3d.geometry.rotation_fit import fit_rotation, turned_by
 from vitamin3d.types import Array, TwoView
 
 
@@ -46,10 +47,17 @@ def initialize_from_two_views(pixels_0: Array, pixels_1: Array, camera: Camera, 
     view = relative_pose(pixels_0, pixels_1, camera, config.ransac_threshold_px)
     if view is None:
         return InitializationAttempt(None, "no essential matrix explains the motion", is_retry=True)
-    return _judged(view, config)
+    return _judged(view, _left_by_a_turn(view, pixels_0, pixels_1, camera, config), config)
 
 
-def _judged(view: TwoView, config: InitializationConfig) -> InitializationAttempt:
+def _left_by_a_turn(view: TwoView, pixels_0: Array, pixels_1: Array, camera: Camera, config: InitializationConfig) -> float:
+    """Median angle, degrees, that the best rotation alone leaves between the rays of the two views."""
+    rays_0, rays_1 = (rays / np.linalg.norm(rays, axis=1, keepdims=True) for rays in map(camera.rays_from_ideal, (pixels_0, pixels_1)))
+    R = fit_rotation(rays_0, rays_1, view.T_1_0[:3, :3], config.ransac_threshold_px / camera.fx)
+    return float(np.degrees(np.median(turned_by(rays_0, rays_1, R))))
+
+
+def _judged(view: TwoView, turn_leaves_deg: float, config: InitializationConfig) -> InitializationAttempt:
     """The attempt with the two views, if they may become a map; else why not."""
     inlier_ratio = float(view.is_inlier.mean())
     good = np.isfinite(view.points_0[:, 0])
@@ -59,6 +67,8 @@ def _judged(view: TwoView, config: InitializationConfig) -> InitializationAttemp
     parallax = float(np.median(view.parallax_deg[view.is_inlier]))
     if parallax < config.min_parallax_deg:
         return InitializationAttempt(None, f"no parallax: {parallax:.2f}° in the median, the camera turns but does not travel", parallax)
+    if turn_leaves_deg < config.turn_deg and parallax > config.max_parallax_ratio * turn_leaves_deg:
+        return InitializationAttempt(None, f"no parallax: a turn explains the {parallax:.2f}° as well, the camera turns but does not travel")
     if good.sum() < max(config.min_tracks, config.min_triangulated_ratio * view.is_inlier.sum()):
         reason = f"only {int(good.sum())} of {int(view.is_inlier.sum())} tracks lie in front of both cameras"
         return InitializationAttempt(None, reason, parallax, is_retry=True)
