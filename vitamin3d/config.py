@@ -155,7 +155,7 @@ class InitializationConfig:
     """Median over the triangulated points."""
     max_parallax_ratio: float = 3.0
     """Of that parallax over the median angle that the best rotation alone leaves: above it a turn explains the pictures as well,"""
-    turn_deg: float = 1.0
+    turn_deg: float = 0.6
     """where it leaves less than this."""
     ransac_threshold_px: float = 1.0
     min_tracks: int = 100

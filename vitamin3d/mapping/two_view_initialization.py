@@ -68,7 +68,7 @@ def _judged(view: TwoView, turn_leaves_deg: float, config: InitializationConfig)
     if parallax < config.min_parallax_deg:
         return InitializationAttempt(None, f"no parallax: {parallax:.2f}° in the median, the camera turns but does not travel", parallax)
     if turn_leaves_deg < config.turn_deg and parallax > config.max_parallax_ratio * turn_leaves_deg:
-        return InitializationAttempt(None, f"no parallax: a turn explains the {parallax:.2f}° as well, the camera turns but does not travel")
+        return InitializationAttempt(None, f"no parallax: a turn explains {parallax:.2f}° as well, the camera turns but does not travel")
     if good.sum() < max(config.min_tracks, config.min_triangulated_ratio * view.is_inlier.sum()):
         reason = f"only {int(good.sum())} of {int(view.is_inlier.sum())} tracks lie in front of both cameras"
         return InitializationAttempt(None, reason, parallax, is_retry=True)
