@@ -64,6 +64,7 @@ class Slam:
         self._directions, self._turns, self._num_doubts = Directions(), Turns(), 0
         self._remembered = RememberedKeyframes(config.relocalization)
         self._untaken = max(UNTAKEN_KEYFRAMES, UNTAKEN_WINDOWS * config.window.keyframes)
+        self._begins_the_run = True
         self._turned_frames: list[int] = []
         self._num_loose = 0
         self.num_lost = 0
@@ -82,7 +83,7 @@ class Slam:
 
     def inherit(self, other: "Slam") -> None:
         """Begins with the camera as another map of the recording has refined it."""
-        self.camera = other.camera
+        self.camera, self._begins_the_run = other.camera, False
         self.calibration.inherit(other.calibration)
 
     def process_frame(self, front: FrontEndFrame) -> SlamState:
@@ -215,20 +216,31 @@ class Slam:
         self.state = SlamState.ROTATING if has_turned else SlamState.INITIALIZING
 
     def _log_history(self) -> None:
-        """Localises the frames from before the map against it: their tracks were kept."""
-        for frame, T_cam_reference in self._turns.since(self.map.frame_indices[0]) if self.number == 0 else []:
+        """Localises the frames from before the map against it, going back from it: their tracks were kept."""
+        for frame, T_cam_reference in self._turns.since(self.map.frame_indices[0]) if self._begins_the_run else []:
             self.poses.add(frame, 0, T_cam_reference)
-        keyframe_of_frame = {index: k for k, index in enumerate(self.map.frame_indices)}
-        for view in self._history.views:
-            k = keyframe_of_frame.get(view.frame.index)
-            if k is not None:
-                self.poses.add(view.frame, k, np.eye(4))
-                continue
-            mapped = self.map.is_mapped(view.tracks.ids)
-            points = self.map.points_world[view.tracks.ids[mapped]]
-            found = localize(points, view.ideal_pixels[mapped], None, self.camera, self.config.localization, self.config.seed)
-            if found.converged:
-                self.poses.add_world(view.frame, found.T_cam_world, self.map)
+        T_next, logged = self.map.T_cam_world[-1], []
+        for view in reversed(self._history.views):
+            T_cam_world = self._pose_of_history(view, T_next)
+            if T_cam_world is not None:
+                T_next = T_cam_world
+                logged.append((view.frame, T_cam_world))
+            elif view.frame.index < self.map.frame_indices[0]:
+                break  # what is farther back shares still less with the map
+        for frame, T_cam_world in reversed(logged):
+            self.poses.add_world(frame, T_cam_world, self.map)
+
+    def _pose_of_history(self, view: TrackedView, T_next: Array) -> Array | None:
+        """T_cam_world of a frame from before the map, None where it is not found; before the first keyframe it needs more landmarks."""
+        if view.frame.index in self.map.frame_indices:
+            return np.asarray(self.map.T_cam_world[self.map.frame_indices.index(view.frame.index)])
+        localization, initialization = self.config.localization, self.config.initialization
+        if view.frame.index < self.map.frame_indices[0]:
+            localization = replace(localization, min_inliers=initialization.min_tracks, min_inlier_ratio=initialization.min_inlier_ratio)
+        mapped = self.map.is_mapped(view.tracks.ids)
+        points = self.map.points_world[view.tracks.ids[mapped]]
+        found = localize(points, view.ideal_pixels[mapped], T_next, self.camera, localization, self.config.seed)
+        return found.T_cam_world if found.converged else None
 
     def _localize(self, front: FrontEndFrame) -> Array | None:
         """T_cam_world of the frame by P3P RANSAC and refinement; ends the tracks that disagree with it."""
