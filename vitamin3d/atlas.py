@@ -2,7 +2,7 @@
 """The maps of a run: what begins, keeps and ends them.
 
 Where the camera is lost, a new map begins beside the search for the old one. Whichever comes first goes on: the old map with the
-camera found in it, or the new one once it has held for a while. A map that is lost while it is young is dropped and made anew.
+camera found in it, or the new one once it has held for a while. A map that was lost while it was young is dropped then.
 """
 
 import numpy as np
@@ -49,9 +49,6 @@ class Atlas:
             self.successor = None
             return state
         self.active.take_adjustment(wait=True)  # both maps may have one adjuster, and it does one thing at a time
-        if self._is_young(self.active) and self.successor is None:
-            self.active = self._new_map()
-            return self.active.process_frame(front)
         return self._succeed(front)
 
     def _succeed(self, front: FrontEndFrame) -> SlamState:
@@ -64,7 +61,7 @@ class Atlas:
             return self.successor.process_frame(front)
         if state is SlamState.TRACKING and not self._is_young(self.successor):
             self.active.leave_turns_to(self.successor)
-            self.left.append(self.active)
+            self.left += [] if self._is_young(self.active) else [self.active]
             self.active, self.successor = self.successor, None
         return state
 

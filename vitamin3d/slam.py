@@ -65,6 +65,7 @@ class Slam:
         self._remembered = RememberedKeyframes(config.relocalization)
         self._untaken = max(UNTAKEN_KEYFRAMES, UNTAKEN_WINDOWS * config.window.keyframes)
         self._begins_the_run = True
+        self._aside: TrackedView | None = None
         self._turned_frames: list[int] = []
         self._num_loose = 0
         self.num_lost = 0
@@ -183,8 +184,14 @@ class Slam:
 
     def _initialize(self, front: FrontEndFrame) -> None:
         """The first map from two frames; the frames before it are localised against it."""
+        view, aside = TrackedView(front.frame, *self._seen(), self._image_motion), self._aside
+        self._aside = view if front.follows is None and self._history.views else None
+        if self._aside is not None:
+            return  # of something else, for all that is known until the next frame
+        if aside is not None and aside.frame.index == front.follows:
+            self._history.append(aside)
         self._turn_on(front.frame)
-        self._history.append(TrackedView(front.frame, *self._seen(), self._image_motion))
+        self._history.append(view)
         ids, pixels_0, pixels_1 = self._history.pair()
         if not self._history.is_worth_a_try(pixels_0, pixels_1):
             return
