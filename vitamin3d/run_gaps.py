@@ -19,7 +19,6 @@ EMPTY_CONTRAST, NOISE_CONTRAST = 2.0, 5.0
 PLAIN_EXTREMA = 150
 FAST_SHARE, STILL_SHARE = 0.08, 0.001
 """Of the picture's width, from one frame to the next."""
-TRACKED = (SlamState.TRACKING, SlamState.UNCERTAIN)
 MIN_PART = 5
 """Frames; a gap is not split into shorter ones."""
 MOST_TOLD = 5
@@ -51,7 +50,7 @@ RULES: dict[Cause, Callable[[FrameNote, float], bool]] = {
     Cause.FAST: lambda note, width_px: note.motion_px > FAST_SHARE * width_px,
     Cause.TURNING: lambda note, _: note.state is SlamState.ROTATING or "turns but does not travel" in note.reason,
     Cause.STANDING: lambda note, width_px: "the picture moved by" in note.reason and note.motion_px < STILL_SHARE * width_px,
-    Cause.TOO_SHORT: lambda note, _: note.state in TRACKED,
+    Cause.TOO_SHORT: lambda note, _: note.state.is_tracked,
     Cause.MOVING: lambda note, _: "not that of a rigid scene" in note.reason,
     Cause.LOST: lambda *_: True,
 }
@@ -135,7 +134,7 @@ def _causes_in_time(notes: Sequence[FrameNote], width_px: float, in_map: Array) 
     something else; and so are those before the last break that comes before the first map.
     """
     kept = {note.map_number for note, is_in in zip(notes, in_map, strict=True) if is_in}
-    dropped = {note.map_number for note in notes if note.state in TRACKED} - kept
+    dropped = {note.map_number for note in notes if note.state.is_tracked} - kept
     plain, begin = _causes(notes, width_px), int(in_map.argmax()) if in_map.any() else -1
     last_break = max((k for k in range(1, begin + 1) if plain[k] is Cause.OTHER_PICTURE), default=0)
     causes, is_cut_off = [], False

@@ -18,7 +18,7 @@ from vitamin3d.mapping.calibration_refinement import CalibrationRefinement
 from vitamin3d.runtime import RunRecord, median_of
 from vitamin3d.scale import Scale
 from vitamin3d.slam import Slam
-from vitamin3d.types import Array, SlamState, StepTimes
+from vitamin3d.types import Array, StepTimes
 
 PACKAGES = ("vitamin3d", "numpy", "scipy", "numba", "opencv-python-headless", "open3d", "pymeshlab")
 
@@ -135,15 +135,12 @@ def _scale_table(scale: Scale) -> dict[str, Any]:
     return {"known": scale.is_known, "metres_per_map_unit": scale.metres_per_unit if scale.is_known else None, "source": scale.source}
 
 
-TRACKED = (SlamState.TRACKING, SlamState.UNCERTAIN)
-
-
 def frame_table(record: RunRecord) -> dict[str, float | None]:
     """Median milliseconds of the frames in which the camera was tracked, and of the others; each with the median of the front end."""
     ahead = float(np.median(record.front_end_seconds)) if record.front_end_seconds else 0.0
     table: dict[str, float | None] = {}
     for name, is_tracked in (("tracked", True), ("not_localised", False)):
-        seconds = [each for state, each in record.frame_seconds if (state in TRACKED) is is_tracked]
+        seconds = [each for state, each in record.frame_seconds if state.is_tracked is is_tracked]
         table[name] = round(1e3 * (float(np.median(seconds)) + ahead), 3) if seconds else None
     return table
 

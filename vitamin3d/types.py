@@ -275,6 +275,11 @@ class SlamState(Enum):
     """Tracked, but what is seen does not determine the pose well: nothing is added to the map."""
     LOST = "lost"
 
+    @property
+    def is_tracked(self) -> bool:
+        """Whether landmarks localise the camera."""
+        return self in (SlamState.TRACKING, SlamState.UNCERTAIN)
+
 
 @dataclass(frozen=True)
 class FrameNote:

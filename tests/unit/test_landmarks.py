@@ -22,6 +22,7 @@ from vitamin3d.mapping.landmark_recovery import (
     same_landmarks,
 )
 from vitamin3d.mapping.landmark_statistics import (
+    add_squared_errors,
     keyframe_vertices,
     landmark_information,
     landmark_statistics,
@@ -29,7 +30,7 @@ from vitamin3d.mapping.landmark_statistics import (
     relative_depth_deviations,
     unit_information,
 )
-from vitamin3d.mapping.landmark_triangulation import _squared_errors, triangulate_landmarks
+from vitamin3d.mapping.landmark_triangulation import triangulate_landmarks
 from vitamin3d.mapping.sparse_map import SparseMap
 from vitamin3d.tracking.curvature import curvature
 from vitamin3d.tracking.extrema import detect_extrema, refine_extrema
@@ -113,7 +114,7 @@ def test_squared_errors_equal_their_twin(scene, rng, oldest):
     poses, starts = sparse_map.T_cam_world, np.array(sparse_map.keyframe_starts)
     R, t = np.ascontiguousarray(poses[:, :3, :3]), np.ascontiguousarray(poses[:, :3, 3])
     observed = sparse_map.obs_landmark, sparse_map.obs_valid, sparse_map.obs_pixels
-    _squared_errors(PINHOLE.intrinsics, R, t, starts, oldest, *observed, first, points, wanted, squared, count)
+    add_squared_errors(PINHOLE.intrinsics, R, t, starts, oldest, *observed, first, points, wanted, squared, count)
     for at, id_ in enumerate(ids):
         errors = []
         for k in range(oldest, 8):

@@ -37,15 +37,19 @@ def _information(intrinsics, R, t, starts, obs_landmark, obs_valid, obs_pixels, 
 
 
 @kernel
-def _accumulate(intrinsics, R, t, starts, obs_landmark, obs_valid, obs_pixels, first, points, count, squared):  # type: ignore[no-untyped-def]
-    """Per landmark: observations that count, and the sum of their squared errors."""
-    for k in range(R.shape[0]):
+def add_squared_errors(  # type: ignore[no-untyped-def]
+    intrinsics, R, t, starts, oldest, obs_landmark, obs_valid, obs_pixels, first, points, wanted, squared, count
+):
+    """Adds squared errors and number of the observations, from the `oldest` keyframe on, of tracks at their numbers in `wanted`.
+
+    `first` and `points` are by that number; -1: not wanted.
+    """
+    for k in range(oldest, R.shape[0]):
         for i in range(starts[k], starts[k + 1]):
-            id_ = obs_landmark[i]
-            if not obs_valid[i] or i < first[id_] or np.isnan(points[id_, 0]):
-                continue
-            count[id_] += 1
-            squared[id_] += squared_error(intrinsics, R[k], t[k], points[id_], obs_pixels[i])
+            at = wanted[obs_landmark[i]]
+            if at >= 0 and obs_valid[i] and i >= first[at]:
+                squared[at] += squared_error(intrinsics, R[k], t[k], points[at], obs_pixels[i])
+                count[at] += 1
 
 
 @kernel
@@ -99,9 +103,10 @@ def landmark_statistics(sparse_map: SparseMap, camera: Camera) -> LandmarkStatis
     size, poses = len(sparse_map.points_world), sparse_map.T_cam_world
     count, squared = np.zeros(size, np.int32), np.zeros(size)
     starts, R, t = np.array(sparse_map.keyframe_starts), np.ascontiguousarray(poses[:, :3, :3]), np.ascontiguousarray(poses[:, :3, 3])
-    _accumulate(
-        camera.intrinsics, R, t, starts, sparse_map.obs_landmark, sparse_map.obs_valid, sparse_map.obs_pixels,
-        sparse_map.first_observation, sparse_map.points_world, count, squared,
+    wanted = np.where(np.isnan(sparse_map.points_world[:, 0]), -1, np.arange(size))
+    add_squared_errors(
+        camera.intrinsics, R, t, starts, 0, sparse_map.obs_landmark, sparse_map.obs_valid, sparse_map.obs_pixels,
+        sparse_map.first_observation, sparse_map.points_world, wanted, squared, count,
     )  # fmt: skip
     return LandmarkStatistics(count, np.sqrt(squared / np.maximum(count, 1)), _widest_angles(sparse_map))
 

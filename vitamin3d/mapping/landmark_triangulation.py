@@ -3,27 +3,13 @@
 
 import numpy as np
 
-from vitamin3d._jit import kernel
 from vitamin3d.config import TriangulationConfig
 from vitamin3d.geometry.camera import Camera
-from vitamin3d.geometry.reprojection import squared_error
 from vitamin3d.geometry.se3 import inverse
 from vitamin3d.geometry.triangulation import triangulate
+from vitamin3d.mapping.landmark_statistics import add_squared_errors
 from vitamin3d.mapping.sparse_map import SparseMap
 from vitamin3d.types import Array
-
-
-@kernel
-def _squared_errors(  # type: ignore[no-untyped-def]
-    intrinsics, R, t, starts, oldest, obs_landmark, obs_valid, obs_pixels, first, points, wanted, squared, count
-):
-    """Adds the squared errors of the observations, from the `oldest` keyframe on, of tracks at their numbers in `wanted`."""
-    for k in range(oldest, R.shape[0]):
-        for i in range(starts[k], starts[k + 1]):
-            at = wanted[obs_landmark[i]]
-            if at >= 0 and obs_valid[i] and i >= first[at]:
-                squared[at] += squared_error(intrinsics, R[k], t[k], points[at], obs_pixels[i])
-                count[at] += 1
 
 
 def triangulate_landmarks(sparse_map: SparseMap, camera: Camera, config: TriangulationConfig) -> int:
@@ -57,7 +43,7 @@ def _agrees_between(sparse_map: SparseMap, ids: Array, first: Array, points: Arr
     squared, count, poses = np.zeros(len(ids)), np.zeros(len(ids), np.int64), sparse_map.T_cam_world
     oldest = max(int(sparse_map.keyframe_of(first).min()), sparse_map.num_keyframes - config.checked_keyframes)
     R, t = np.ascontiguousarray(poses[:, :3, :3]), np.ascontiguousarray(poses[:, :3, 3])
-    _squared_errors(
+    add_squared_errors(
         camera.intrinsics, R, t, np.array(sparse_map.keyframe_starts), oldest, sparse_map.obs_landmark, sparse_map.obs_valid,
         sparse_map.obs_pixels, first, points, wanted, squared, count,
     )  # fmt: skip

@@ -146,12 +146,6 @@ def localize(
     if start is None:
         return failed
     T = refine_pose(start, points_world, pixels, camera, config.sigma_px, config.iterations)
-    return _judged(T, points_world, pixels, camera, config)
-
-
-def _judged(T: Array, points_world: Array, pixels: Array, camera: Camera, config: LocalizationConfig) -> Localization:
-    """A refined pose with its inliers, converged where they are enough."""
-    n = len(points_world)
     errors = reprojection_errors(T, points_world, pixels, camera.intrinsics)
     is_inlier = errors < _outlier_limit(errors, config)
     enough = is_inlier.sum() >= max(config.min_inliers, config.min_inlier_ratio * n)

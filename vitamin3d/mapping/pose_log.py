@@ -55,7 +55,7 @@ class PoseLog:
 
     def predict(self, sparse_map: SparseMap) -> Array:
         """T_cam_world (4, 4) of the next frame, moving on as between the last two."""
-        newest = self.pose(self._last[-1], sparse_map)
+        newest = self.newest(sparse_map)
         if len(self._last) < 2 or self._last[1] - self._last[0] != 1:
             return newest
         return np.asarray(newest @ inverse(self.pose(self._last[0], sparse_map)) @ newest)

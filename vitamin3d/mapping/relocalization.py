@@ -8,7 +8,6 @@ keyframe's corner that lies on a landmark's observation lends it that landmark, 
 from collections.abc import Iterable
 from dataclasses import replace
 
-import cv2
 import numpy as np
 from scipy.spatial import cKDTree
 
@@ -16,18 +15,8 @@ from vitamin3d.config import LocalizationConfig, RelocalizationConfig
 from vitamin3d.geometry.camera import Camera
 from vitamin3d.mapping.p3p_localization import localize
 from vitamin3d.mapping.sparse_map import SparseMap
+from vitamin3d.tracking.corners import described_corners, mutual_matches
 from vitamin3d.types import Array, Frame, Localization
-
-FAST_THRESHOLD = 7
-
-
-def described_corners(image: Array, count: int) -> tuple[Array, Array]:
-    """Corners (N, 2) in distorted pixels of a picture (H, W) uint8, and their binary descriptors (N, 32) uint8."""
-    orb = cv2.ORB_create(count, fastThreshold=FAST_THRESHOLD)  # type: ignore[attr-defined]
-    keypoints, descriptors = orb.detectAndCompute(image, None)
-    if descriptors is None:
-        return np.zeros((0, 2)), np.zeros((0, 32), np.uint8)
-    return np.array([k.pt for k in keypoints], np.float64), descriptors
 
 
 class RememberedKeyframes:
@@ -94,8 +83,7 @@ def landmark_matches(
     lent = np.flatnonzero(distances < config.max_distance_px)
     if len(lent) == 0:
         return none
-    matches = cv2.BFMatcher(cv2.NORM_HAMMING, crossCheck=True).match(descriptors[lent], corners[1])
-    pairs = np.array([(m.queryIdx, m.trainIdx) for m in matches], np.int64).reshape(-1, 2)
+    pairs = mutual_matches(descriptors[lent], corners[1])
     return ids[usable][nearest[lent[pairs[:, 0]]]], pairs[:, 1]
 
 

@@ -11,9 +11,9 @@ import cv2
 import numpy as np
 
 from vitamin3d.config import ContinuityConfig
+from vitamin3d.tracking.corners import described_corners, mutual_matches
 from vitamin3d.types import Array
 
-FAST_THRESHOLD = 7
 HOMOGRAPHY_PX, HOMOGRAPHY_ITERATIONS = 6.0, 500
 
 
@@ -65,14 +65,11 @@ def correlation(a: Array, b: Array, flow: Array) -> float:
 
 def homography_flow(a: Array, b: Array, config: ContinuityConfig) -> Array | None:
     """Flow (h, w, 2) float32 by the homography of matched corners of two pictures (h, w) uint8; None where few agree on one."""
-    orb = cv2.ORB_create(config.corners, fastThreshold=FAST_THRESHOLD)  # type: ignore[attr-defined]
-    (points_a, words_a), (points_b, words_b) = (orb.detectAndCompute(picture, None) for picture in (a, b))
-    if words_a is None or words_b is None:
+    (points_a, words_a), (points_b, words_b) = (described_corners(picture, config.corners) for picture in (a, b))
+    pairs = mutual_matches(words_a, words_b)
+    if len(pairs) < config.min_matches:
         return None
-    matches = cv2.BFMatcher(cv2.NORM_HAMMING, crossCheck=True).match(words_a, words_b)
-    if len(matches) < config.min_matches:
-        return None
-    x, y = np.array([points_a[m.queryIdx].pt for m in matches]), np.array([points_b[m.trainIdx].pt for m in matches])
+    x, y = points_a[pairs[:, 0]], points_b[pairs[:, 1]]
     H, agrees = cv2.findHomography(x, y, cv2.RANSAC, HOMOGRAPHY_PX, maxIters=HOMOGRAPHY_ITERATIONS)
     if H is None or agrees.sum() < config.min_matches:
         return None

@@ -7,6 +7,7 @@ import cv2
 import numpy as np
 
 from vitamin3d.config import DominantFlowConfig
+from vitamin3d.tracking.corners import mutual_matches
 from vitamin3d.types import Array, DominantFlow
 
 PATCH_PX = 15
@@ -41,10 +42,7 @@ def coarse_features(image: Array, config: DominantFlowConfig) -> CoarseFeatures:
 
 def match_features(previous: CoarseFeatures, current: CoarseFeatures) -> tuple[Array, Array]:
     """Mutually best matches: pixels (N, 2) in the previous and (N, 2) in the current image."""
-    if len(previous.pixels) == 0 or len(current.pixels) == 0:
-        return np.zeros((0, 2)), np.zeros((0, 2))
-    matches = cv2.BFMatcher(cv2.NORM_HAMMING, crossCheck=True).match(previous.descriptors, current.descriptors)
-    i = np.array([(m.queryIdx, m.trainIdx) for m in matches], np.int64).reshape(-1, 2)
+    i = mutual_matches(previous.descriptors, current.descriptors)
     return previous.pixels[i[:, 0]], current.pixels[i[:, 1]]
 
 
