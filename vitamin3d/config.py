@@ -114,6 +114,12 @@ class ExtremaTrackingConfig:
     max_steps: int = 10
     flow_octave: int = 1
     """The finest octave of the dense flow: 0 the picture's own pixels, 1 half of them in each direction, ..."""
+    flow_patch: int = 8
+    """Side of the patches that the dense flow is found by, its own pixels; large ones slide less along edges and follow noise less,"""
+    flow_stride: int = 4
+    """and their distance."""
+    flow_blur_px: float = 0.0
+    """Deviation of the blur of the reduced pictures before the flow is computed."""
     gate_px: float = 1.05
     """A climb that ends farther from the prediction is a miss: where the flow is exact, a far extremum is another one."""
     gate_medians: float = 1.25

@@ -34,6 +34,21 @@ def test_dense_flow_is_that_of_the_picture_and_starts_with_the_second():
     assert (np.abs(middle - SHIFT).max(axis=2) < 0.5).mean() > 0.9
 
 
+def test_large_patches_of_a_blurred_picture_follow_noise_less():
+    """The step of a noisy picture, median error in pixels: the patches of the default against larger ones."""
+    rng, errors = np.random.default_rng(5), []
+    noisy = [
+        replace(frame, image=np.clip(0.15 * frame.image + rng.normal(90, 8, frame.image.shape), 0, 255).astype(np.uint8))
+        for frame in frames()
+    ]
+    for settings in ({}, {"flow_patch": 16, "flow_stride": 12, "flow_blur_px": 1.0}):
+        front_end = FrontEnd(replace(Config(), extrema_tracking=replace(Config().extrema_tracking, **settings)))
+        flow = [front_end.process(frame) for frame in noisy][1].dense_flow
+        errors.append(np.median(np.hypot(*np.moveaxis(Config().extrema_tracking.flow_reduction * flow[20:-20, 20:-20] - SHIFT, -1, 0))))
+    assert errors[1] < 0.7 * errors[0]
+    assert errors[1] < 1.5
+
+
 def test_the_paper_uses_dominant_flow_instead():
     front_end = FrontEnd(paper_config())
     first, second = (front_end.process(frame) for frame in frames())

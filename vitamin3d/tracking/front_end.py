@@ -25,6 +25,8 @@ def dense_flow_solver(config: Config) -> cv2.DISOpticalFlow:
     dis: cv2.DISOpticalFlow = cv2.DISOpticalFlow_create(cv2.DISOPTICAL_FLOW_PRESET_ULTRAFAST)  # type: ignore[attr-defined]
     dis.setFinestScale(max(0, config.extrema_tracking.flow_octave - round(float(np.log2(config.extrema_tracking.flow_reduction)))))
     dis.setGradientDescentIterations(DESCENT_ITERATIONS)
+    dis.setPatchSize(config.extrema_tracking.flow_patch)
+    dis.setPatchStride(config.extrema_tracking.flow_stride)
     return dis
 
 
@@ -73,7 +75,8 @@ class FrontEnd:
         reduction = self.config.extrema_tracking.flow_reduction
         height, width = (n // reduction for n in image.shape)
         whole = image[: height * reduction, : width * reduction]  # so that the reduction is exact
-        return np.asarray(cv2.resize(whole, (width, height), interpolation=cv2.INTER_AREA))
+        small, blur = cv2.resize(whole, (width, height), interpolation=cv2.INTER_AREA), self.config.extrema_tracking.flow_blur_px
+        return np.asarray(cv2.GaussianBlur(small, (0, 0), blur) if blur > 0 else small)
 
     def _update_dominant_flow(self, image: Array) -> None:
         features = coarse_features(image, self.config.dominant_flow)
