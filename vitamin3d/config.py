@@ -33,6 +33,8 @@ AT_LEAST_ONE = (
     "extrema.refill_interval",
     "dominant_flow.reduction",
     "extrema_tracking.flow_reduction",
+    "extrema_tracking.flow_patch",
+    "extrema_tracking.flow_stride",
     "initialization.history",
     "recovery.interval",
     "bundle_adjustment.keyframe_interval",

@@ -56,6 +56,7 @@ def test_a_file_changes_only_what_it_names(tmp_path):
         ("[extrema]\nmin_curvature = nan", "extrema.min_curvature must be a finite number"),
         ("[extrema]\nmin_curvature = inf", "extrema.min_curvature must be a finite number"),
         ("[recovery]\ninterval = 0", "recovery.interval must be at least 1"),
+        ("[extrema_tracking]\nflow_stride = 0", "extrema_tracking.flow_stride must be at least 1"),
         ("seed = ", "not a readable TOML file"),
         ("[extrema", "not a readable TOML file"),
     ],
