@@ -78,6 +78,10 @@ class ExtremaConfig:
     """but not below this,"""
     noise_curvature: float = 0.004
     """nor below this many times the third power of the deviation of the picture's noise. Curvatures are then scaled to `min_curvature`."""
+    significance: float = 5.0
+    """Deviations of the noise by which gradient and bend of a maximum stand above it, 0: any;"""
+    significant_wanted: int = 1000
+    """where fewer maxima do, the most significant ones up to this number."""
     min_roundness: float = 0.65
     """4 det / trace² of kappa's Hessian at the maximum: on a ridge (0) it slides, on a round hill (1) it stays; 0: all maxima."""
     max_tracks: int = 9000
@@ -116,11 +120,12 @@ class ExtremaTrackingConfig:
     max_steps: int = 10
     flow_octave: int = 1
     """The finest octave of the dense flow: 0 the picture's own pixels, 1 half of them in each direction, ..."""
-    flow_patch: int = 8
-    """Side of the patches that the dense flow is found by, its own pixels; large ones slide less along edges and follow noise less,"""
-    flow_stride: int = 4
+    flow_patch: int = 16
+    """Side of the patches that the dense flow is found by, pixels of a reduced picture of 376 × 240, in others in proportion; large ones
+    slide less along edges and follow noise less,"""
+    flow_stride: int = 12
     """and their distance."""
-    flow_blur_px: float = 0.0
+    flow_blur_px: float = 1.0
     """Deviation of the blur of the reduced pictures before the flow is computed."""
     gate_px: float = 1.05
     """A climb that ends farther from the prediction is a miss: where the flow is exact, a far extremum is another one."""
@@ -143,7 +148,7 @@ class ContinuityConfig:
     """Of the grid, beyond the flow's own."""
     min_contrast: float = 1.5
     """Grey levels on the grid; a picture with less shows nothing (a covered lens)."""
-    good_correlation: float = 0.9
+    good_correlation: float = 0.97
     """Below it the flow is tried once more, beginning with a homography of matched corners: large steps, dropped pictures."""
     min_correlation: float = 0.6
     """Below it the picture goes on from another one, or from none: a cut, a stray picture."""
@@ -216,13 +221,20 @@ class RotationConfig:
     min_tracks: int = 50
     """That agree on the rotation;"""
     min_share: float = 0.4
-    """and this share of all: parallax disagrees;"""
-    min_old_share: float = 0.95
+    """and this share of all: parallax disagrees; before there is a map, and"""
+    min_share_in_map: float = 0.5
+    """this share where its frame is placed in a map;"""
+    min_old_share: float = 0.8
     """and of the older half of the tracks this many times as large a share,"""
-    max_doubts: int = 3
+    max_doubts: int = 5
     """except in so many frames in a row; so many tries to initialise in a row must show parallax as well."""
     sigma_px: float = 1.0
-    max_parallax_deg: float = 0.2
+    """Of the directions of tracks, and"""
+    sigma_deg: float = 0.125
+    """the same as an angle, where that is more: a turn in the hand shifts the camera a little."""
+    max_shift: float = 0.2
+    """Of the median depth: a camera found farther than this from where a turn began has done more, and the turn's frames are given up."""
+    max_parallax_deg: float = 0.4
     """Median, of a try to initialise; above it the camera has travelled."""
     min_turn_deg: float = 5.0
     """Of a camera without a map that is said to turn."""
@@ -243,7 +255,10 @@ class KeyframeConfig:
 class TriangulationConfig:
     """Sec. 5.1: when a track becomes a landmark."""
 
-    min_parallax_deg: float = 1.0
+    min_parallax_deg: float = 0.5
+    """Between its first and its newest observation, and"""
+    parallax_deviations: float = 10.0
+    """this many deviations of the two cameras' places, as angles: an error of the pose looks like parallax, and makes a scale."""
     max_reprojection_px: float = 3.0
     max_rms_px: float = 1.5
     """Of all its observations in the last `checked_keyframes`; 0: the first and the newest alone are looked at."""
@@ -300,6 +315,10 @@ class AtlasConfig:
     min_keyframes: int = 5
     """A map that is lost with fewer, or with fewer frames localised, is dropped and made anew."""
     min_frames: int = 15
+    min_rigid_share: float = 0.25
+    """And one in which fewer of the tracks that show parallax become landmarks: it may be that of something that moves, or of a turn;"""
+    judged_tracks: int = 500
+    """after so many such tracks."""
 
 
 @dataclass(frozen=True)
@@ -690,7 +709,7 @@ def paper_config() -> Config:
         ),
         continuity=ContinuityConfig(enabled=False),
         localization=LocalizationConfig(prior_inlier_ratio=2.0, outlier_medians=100.0, votes=0),
-        triangulation=TriangulationConfig(max_rms_px=0.0),
+        triangulation=TriangulationConfig(min_parallax_deg=1.0, parallax_deviations=0.0, max_rms_px=0.0),
         rotation=RotationConfig(enabled=False),
         recovery=RecoveryConfig(enabled=False),
         relocalization=RelocalizationConfig(enabled=False),

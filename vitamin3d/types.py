@@ -67,6 +67,8 @@ class FrontEndFrame:
     else, None where the picture continues none of them."""
     noise: float = 0.0
     """Standard deviation of the noise of this picture and those before it, grey levels; 0 where it is not measured."""
+    is_repeat: bool = False
+    """The picture is the one before once more, bit by bit: it says nothing about where the camera is by now."""
 
 
 @dataclass(frozen=True)

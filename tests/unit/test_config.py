@@ -83,6 +83,7 @@ def test_the_paper_differs_where_the_paper_does():
     assert paper.extrema.min_roundness == paper.extrema_tracking.min_roundness == 0.0  # "all extrema"
     assert not paper.continuity.enabled and not paper.rotation.enabled and not paper.relocalization.enabled
     assert paper.extrema.wanted == paper.extrema_tracking.gate_medians == paper.localization.votes == paper.triangulation.max_rms_px == 0
+    assert (paper.triangulation.min_parallax_deg, paper.triangulation.parallax_deviations) == (1.0, 0.0)
     same = ("dominant_flow", "initialization", "nltgv", "atlas")
     assert all(getattr(paper, group) == getattr(Config(), group) for group in same)
 

@@ -18,7 +18,8 @@ BLACK = np.zeros((HEIGHT, WIDTH), np.uint8)
 
 
 def tracker(**settings):
-    return FlowTracker(dense_flow_solver(Config()), dense_flow_solver(Config()), dataclasses.replace(CONFIG, **settings))
+    quick, patient = (dense_flow_solver(Config(), (HEIGHT, WIDTH), patient) for patient in (False, True))
+    return FlowTracker(quick, patient, dataclasses.replace(CONFIG, **settings))
 
 
 def followed(pictures, found=None, **settings):
@@ -67,12 +68,15 @@ def changed(picture, how, rng):
         return np.clip(picture + 20.0 * rng.standard_normal(picture.shape), 0, 255).astype(np.uint8)
     if how == "partly hidden":
         return np.where(np.arange(WIDTH) < 0.2 * WIDTH, 150, picture).astype(np.uint8)
-    if how == "upside down":
-        return cv2.flip(picture, -1)
+    if how == "rolled":
+        angle = np.radians(50)
+        A = np.array([[np.cos(angle), -np.sin(angle)], [np.sin(angle), np.cos(angle)]])
+        centre = 0.5 * np.array([WIDTH - 1, HEIGHT - 1])
+        return warped(picture, A, centre - A @ centre)
     raise AssertionError(how)
 
 
-HOWS = ("shifted", "turned and nearer", "blurred", "out of focus", "brighter", "darker", "noisy", "partly hidden", "upside down")
+HOWS = ("shifted", "turned and nearer", "blurred", "out of focus", "brighter", "darker", "noisy", "partly hidden", "rolled")
 
 
 # --- one step --------------------------------------------------------------------------------------------------------

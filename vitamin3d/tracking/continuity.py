@@ -87,11 +87,13 @@ class FlowTracker:
         self._dis, self._dis_from, self.config = dis, dis_from, config
         self._previous: View | None = None
         self._before_break: View | None = None
+        self.is_exact = True
+        """Whether the newest flow explains its picture well; where it does not, the step was large."""
 
     def follow(self, index: int, picture: Array) -> tuple[Array | None, int | None]:
         """The flow (h, w, 2) from the picture that a reduced picture (h, w) uint8 continues, and that one's index; None for none."""
         view = view_of(index, picture, self.config)
-        previous, self._previous = self._previous, view
+        previous, self._previous, self.is_exact = self._previous, view, True
         if previous is None:
             return None, None
         if not self.config.enabled:
@@ -104,6 +106,7 @@ class FlowTracker:
             found = None if candidate is None else self._continuation(candidate, view)
             if candidate is not None and found is not None and found.correlation >= self.config.min_correlation:
                 self._forget_break(candidate, view.index)
+                self.is_exact = found.correlation >= self.config.good_correlation
                 return found.flow, candidate.index
         if earlier is None or earlier.contrast < self.config.min_contrast or view.index - earlier.index > self.config.max_gap:
             self._before_break = previous

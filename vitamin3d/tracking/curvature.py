@@ -46,7 +46,11 @@ def curvature(image: Array, config: CurvatureConfig) -> Array:
     Unchanged by a brightness offset; a contrast gain g multiplies it by g³. Signed: dark ridges and the outer side of
     bright corners are positive, and an 8-bit type would lose half of it.
     """
-    f = smoothed(image, config)
+    return curvature_of(smoothed(image, config))
+
+
+def curvature_of(f: Array) -> Array:
+    """kappa (H, W) float32 of a blurred picture (H, W) float32 (Eq. 1)."""
     kappa = np.empty_like(f)
     _curvature(f, kappa)
     return kappa
