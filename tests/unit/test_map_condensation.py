@@ -24,7 +24,7 @@ def some_map(rng, keyframes=12, ids=60):
         pose = np.eye(4)
         pose[:3, 3] = rng.normal(size=3)
         colors, patches = rng.integers(0, 255, (len(seen), 3)), rng.integers(0, 255, (len(seen), 81))
-        made.add_keyframe(10 * k, 1000 * k, pose, seen, rng.normal(size=(len(seen), 2)), colors, patches, rng.normal(size=(6, 2)))
+        made.add_keyframe(10 * k, 1000 * k, pose, seen, rng.normal(size=(len(seen), 2)), colors, patches, rng.normal(size=(6, 2)), 0.1 * k)
     landmarks = rng.choice(ids, ids // 2, replace=False)
     made.points_world[landmarks] = rng.normal(size=(len(landmarks), 3))
     made.remove_observations(rng.choice(len(made.obs_landmark), 40, replace=False))
@@ -51,6 +51,7 @@ def test_what_stays_is_what_it_was(rng):
     assert new.frame_indices == [10 * k for k in keyframes] and new.timestamps_ns == [1000 * k for k in keyframes]
     np.testing.assert_array_equal(new.T_cam_world, old.T_cam_world[keyframes])
     np.testing.assert_array_equal(new.image_motions, old.image_motions[keyframes])
+    np.testing.assert_array_equal(new.position_deviations_deg, 0.1 * keyframes)
     seen_again = 0
     for id_ in range(60):
         pixels = [counting(old, k, id_) for k in keyframes]
@@ -133,7 +134,7 @@ def unforgetting(demo):
 
 
 def test_forgetting_dead_tracks_changes_nothing(demo, unforgetting):
-    (a, record_a), (b, record_b) = unforgetting, run(demo, MemoryConfig(max_new_tracks=1000))
+    (a, record_a), (b, record_b) = unforgetting, run(demo, MemoryConfig(max_new_tracks=700))
     assert len(b.times.milliseconds["condense"]) > 3 and "condense" not in a.times.milliseconds
     np.testing.assert_array_equal(a.trajectory().T_world_cam, b.trajectory().T_world_cam)
     assert len(b.map.obs_landmark) < len(a.map.obs_landmark) and len(b.map.points_world) < len(a.map.points_world)

@@ -44,6 +44,15 @@ def test_observations_are_stored_by_keyframe():
     check_counts(sparse_map)
 
 
+def test_how_well_the_places_of_keyframes_are_known_is_kept():
+    sparse_map, empty = SparseMap(), (np.zeros((1, 2)), np.zeros((1, 3), np.uint8), np.zeros((1, 81), np.uint8))
+    assert sparse_map.position_deviations_deg.shape == (0,)
+    for k in range(300):
+        sparse_map.add_keyframe(k, k, np.eye(4), np.array([0]), *empty, position_deviation_deg=0.1 * k)
+    add(sparse_map, [0, 1])  # where nothing is said it is known exactly
+    np.testing.assert_array_equal(sparse_map.position_deviations_deg, [*(0.1 * k for k in range(300)), 0.0])
+
+
 def test_keyframe_of_is_the_keyframe_of_each_observation():
     sparse_map = SparseMap()
     for ids in ([0, 1], [], [2], [0, 1, 2]):

@@ -1,6 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
 """New landmarks from tracks that have gained enough parallax (Sec. 5.1)."""
 
+from dataclasses import dataclass
+
 import numpy as np
 
 from vitamin3d.config import TriangulationConfig
@@ -12,10 +14,31 @@ from vitamin3d.mapping.sparse_map import SparseMap
 from vitamin3d.types import Array
 
 
-def triangulate_landmarks(sparse_map: SparseMap, camera: Camera, config: TriangulationConfig) -> int:
+@dataclass
+class Rigidity:
+    """Of the tracks of a map that showed parallax, how many did so as points of one rigid scene."""
+
+    num_tracks: int = 0
+    num_rigid: int = 0
+
+    def add(self, num_tracks: int, num_rigid: int) -> None:
+        """Counts tracks with parallax, and those among them that have become landmarks."""
+        self.num_tracks += num_tracks
+        self.num_rigid += num_rigid
+
+    @property
+    def share(self) -> float:
+        """In [0, 1]; 1 where no track has shown parallax yet."""
+        return self.num_rigid / self.num_tracks if self.num_tracks else 1.0
+
+
+def triangulate_landmarks(sparse_map: SparseMap, camera: Camera, config: TriangulationConfig, rigidity: Rigidity | None = None) -> int:
     """Gives points to the newest keyframe's tracks that have none, from their first and their newest observation.
 
-    A point must have the parallax, lie in front of both cameras and reproject well in both.
+    A point must have the parallax, more where the cameras' places are less certain; lie in front of both cameras; reproject well in both.
+
+    Args:
+        rigidity: counts the tracks with parallax and those that became landmarks.
 
     Returns:
         The number of new landmarks.
@@ -27,10 +50,12 @@ def triangulate_landmarks(sparse_map: SparseMap, camera: Camera, config: Triangu
     pending = ~sparse_map.is_mapped(ids) & (first >= 0) & (first < rows[0]) & sparse_map.obs_valid[rows]
     pending[pending] &= sparse_map.num_observations[ids[pending]] >= config.min_observations
     rows, ids, first = rows[pending], ids[pending], first[pending]
-    points, good = _two_ray_points(sparse_map, first, rows, camera, config)
+    points, has_parallax, good = _two_ray_points(sparse_map, first, rows, camera, config)
     rows, ids, first, points = rows[good], ids[good], first[good], points[good]
     good = _agrees_between(sparse_map, ids, first, points, camera, config)
     sparse_map.points_world[ids[good]] = points[good]
+    if rigidity is not None:
+        rigidity.add(int(has_parallax.sum()), int(good.sum()))
     return int(good.sum())
 
 
@@ -50,8 +75,17 @@ def _agrees_between(sparse_map: SparseMap, ids: Array, first: Array, points: Arr
     return np.asarray(np.sqrt(squared / np.maximum(count, 1)) <= config.max_rms_px)
 
 
-def _two_ray_points(sparse_map: SparseMap, first: Array, newest: Array, camera: Camera, config: TriangulationConfig) -> tuple[Array, Array]:
-    """World points (N, 3) of two observations each, and which of them (N,) pass the gates."""
+def _least_parallax_deg(sparse_map: SparseMap, first: Array, config: TriangulationConfig) -> Array:
+    """(N,) that the scene must show between the keyframes of observations `first` (N,) and the newest, above that of the poses' errors."""
+    deviations = sparse_map.position_deviations_deg
+    of_pair = np.hypot(deviations[sparse_map.keyframe_of(first)], deviations[-1])
+    return np.asarray(np.maximum(config.min_parallax_deg, config.parallax_deviations * of_pair))
+
+
+def _two_ray_points(
+    sparse_map: SparseMap, first: Array, newest: Array, camera: Camera, config: TriangulationConfig
+) -> tuple[Array, Array, Array]:
+    """World points (N, 3) of two observations each, which of them (N,) have parallax, and which pass the other gates as well."""
     T_a_world = sparse_map.T_cam_world[sparse_map.keyframe_of(first)]
     T_b_world = sparse_map.T_cam_world[-1]
     pixels_a, pixels_b = sparse_map.obs_pixels[first], sparse_map.obs_pixels[newest]
@@ -62,5 +96,6 @@ def _two_ray_points(sparse_map: SparseMap, first: Array, newest: Array, camera: 
     with np.errstate(invalid="ignore"):
         error_a = np.linalg.norm(camera.ideal_from_points(points_a) - pixels_a, axis=1)
         error_b = np.linalg.norm(camera.ideal_from_points(points_b) - pixels_b, axis=1)
-        good = (parallax >= config.min_parallax_deg) & (np.maximum(error_a, error_b) <= config.max_reprojection_px)
-    return points, good
+        has_parallax = parallax >= _least_parallax_deg(sparse_map, first, config)
+        good = has_parallax & (np.maximum(error_a, error_b) <= config.max_reprojection_px)
+    return points, has_parallax, good

@@ -60,12 +60,14 @@ def build_first_map(two_view: TwoView, ids: Array, views: list[TrackedView], cam
     return FirstMap(sparse_map, [*chosen, views[-1]]) if is_sound else None
 
 
-def add_view(sparse_map: SparseMap, view: TrackedView, T_cam_world: Array) -> int:
-    """Adds a tracked view as a keyframe; its index."""
+def add_view(sparse_map: SparseMap, view: TrackedView, T_cam_world: Array, position_deviation_deg: float = 0.0) -> int:
+    """Adds a tracked view as a keyframe, whose place is known to an angle at the median depth; its index."""
     colors, patches = sample_colors(view.frame, view.tracks.pixels), cut_patches(view.frame.image, view.tracks.pixels)
     frame = view.frame
     ids, pixels = view.tracks.ids, view.ideal_pixels
-    return sparse_map.add_keyframe(frame.index, frame.timestamp_ns, T_cam_world, ids, pixels, colors, patches, view.image_motion)
+    return sparse_map.add_keyframe(
+        frame.index, frame.timestamp_ns, T_cam_world, ids, pixels, colors, patches, view.image_motion, position_deviation_deg
+    )
 
 
 def _add_between(sparse_map: SparseMap, view: TrackedView, last: TrackedView, camera: Camera, config: Config) -> list[TrackedView]:

@@ -91,6 +91,7 @@ class SparseMap:
         self.keyframe_starts: list[int] = [0]
         self._poses = GrowingArray((4, 4), np.float64, 0.0)
         self._motions = GrowingArray(NO_MOTION.shape, np.float64, 0.0)
+        self._deviations = GrowingArray((), np.float64, 0.0)
         self._obs_landmark = GrowingArray((), np.int64, -1)
         self._obs_pixels = GrowingArray((2,), np.float64, np.nan)
         self._obs_valid = GrowingArray((), np.bool_, False)
@@ -114,6 +115,11 @@ class SparseMap:
     def image_motions(self) -> Array:
         """(K, 6, 2) how the image moved when the keyframes were taken (`geometry/rolling_shutter.py`); a view."""
         return self._motions.view
+
+    @property
+    def position_deviations_deg(self) -> Array:
+        """(K,) how well the keyframes' places were known when they were taken, as angles at the median depth; a view."""
+        return self._deviations.view
 
     @property
     def points_world(self) -> Array:
@@ -181,7 +187,7 @@ class SparseMap:
 
     def add_keyframe(
         self, frame_index: int, timestamp_ns: int, T_cam_world: Array, ids: Array, pixels: Array, colors: Array, patches: Array,
-        image_motion: Array = NO_MOTION,
+        image_motion: Array = NO_MOTION, position_deviation_deg: float = 0.0,
     ) -> int:  # fmt: skip
         """Adds a keyframe with the observations of all its tracks, landmarks or not.
 
@@ -192,6 +198,7 @@ class SparseMap:
             colors: (N, 3) uint8.
             patches: (N, 81) uint8.
             image_motion: (6, 2).
+            position_deviation_deg: of the camera's place, as the angle that it makes up at the median depth.
 
         Returns:
             The index of the keyframe.
@@ -201,6 +208,7 @@ class SparseMap:
         self.timestamps_ns.append(timestamp_ns)
         self._poses.append(T_cam_world[None])
         self._motions.append(image_motion[None])
+        self._deviations.append(np.array([position_deviation_deg]))
         self._obs_landmark.append(ids)
         self._obs_pixels.append(pixels)
         self._obs_valid.append(np.ones(len(ids), np.bool_))
@@ -293,6 +301,7 @@ class SparseMap:
         copy.timestamps_ns = [self.timestamps_ns[k] for k in keyframes]
         copy._poses.append(self.T_cam_world[keyframes])
         copy._motions.append(self.image_motions[keyframes])
+        copy._deviations.append(self.position_deviations_deg[keyframes])
         copy._obs_landmark.append(new_id[self.obs_landmark[counts]])
         copy._obs_pixels.append(self.obs_pixels[counts])
         copy._obs_valid.append(np.ones(int(counts.sum()), np.bool_))
