@@ -43,6 +43,9 @@ class Atlas:
         return state
 
     def _tracked(self, front: FrontEndFrame) -> SlamState:
+        if self._is_false(self.active):
+            self.active.take_adjustment(wait=True)
+            self.active = self._new_map()
         state = self.active.process_frame(front)
         is_held = state not in (SlamState.LOST, SlamState.ROTATING)
         if is_held or self.active.map.num_keyframes == 0:
@@ -56,7 +59,7 @@ class Atlas:
         self.successor = self.successor or self._new_map()
         state = self.successor.process_frame(front)
         self.successor.take_adjustment(wait=True)
-        if state is SlamState.LOST:
+        if state is SlamState.LOST or self._is_false(self.successor):
             self.successor = self._new_map()
             return self.successor.process_frame(front)
         if state is SlamState.TRACKING and not self._is_young(self.successor):
@@ -75,7 +78,14 @@ class Atlas:
         return slam
 
     def _is_young(self, slam: Slam) -> bool:
-        return slam.map.num_keyframes < self.config.atlas.min_keyframes or len(slam.poses) < self.config.atlas.min_frames
+        """Whether a map holds too little to be kept, or something that is not one rigid scene."""
+        atlas = self.config.atlas
+        is_small = slam.map.num_keyframes < atlas.min_keyframes or len(slam.poses) < atlas.min_frames
+        return is_small or self._is_false(slam)
+
+    def _is_false(self, slam: Slam) -> bool:
+        """Whether most tracks that show parallax contradict the map: it may be that of something that moves."""
+        return slam.rigidity.num_tracks >= self.config.atlas.judged_tracks and slam.rigidity.share < self.config.atlas.min_rigid_share
 
     def _note(self, front: FrontEndFrame, state: SlamState) -> FrameNote:
         flow, slam, frame = front.dense_flow, self.current, front.frame

@@ -13,17 +13,19 @@ from vitamin3d.bundle_adjustment.subspace import adjust_subspace
 from vitamin3d.bundle_adjustment.variables import squared_reprojection_errors
 from vitamin3d.config import Config
 from vitamin3d.geometry.camera import Camera
+from vitamin3d.geometry.reprojection import reprojection_errors
 from vitamin3d.geometry.rolling_shutter import NO_MOTION, at_one_moment, fit_image_motion, ideal_pixels
-from vitamin3d.geometry.se3 import inverse
+from vitamin3d.geometry.se3 import between, inverse
 from vitamin3d.mapping.calibration_refinement import CalibrationRefinement
 from vitamin3d.mapping.initialization_history import InitializationHistory, TrackedView
 from vitamin3d.mapping.keyframe_selection import is_keyframe
 from vitamin3d.mapping.landmark_recovery import recover_landmarks, same_landmarks
 from vitamin3d.mapping.landmark_statistics import UnitInformation, keyframe_vertices
-from vitamin3d.mapping.landmark_triangulation import triangulate_landmarks
+from vitamin3d.mapping.landmark_triangulation import Rigidity, triangulate_landmarks
 from vitamin3d.mapping.map_condensation import condense, is_due
 from vitamin3d.mapping.map_initialization import add_view, build_first_map
 from vitamin3d.mapping.p3p_localization import localize, localize_by, voters
+from vitamin3d.mapping.pose_deviation import position_deviation_deg
 from vitamin3d.mapping.pose_log import PoseLog
 from vitamin3d.mapping.readout_estimation import set_image_motion
 from vitamin3d.mapping.relocalization import RememberedKeyframes, is_search_due, relocalize
@@ -52,6 +54,7 @@ class Slam:
         self.state = SlamState.INITIALIZING
         self.tracks = Tracks.empty()
         self.map = SparseMap()
+        self.rigidity = Rigidity()
         self.poses = PoseLog()
         self.times = times or StepTimes()
         self.initialization_reason, self.initialization_retries = "no frame was read", 0
@@ -67,6 +70,7 @@ class Slam:
         self._begins_the_run = True
         self._aside: TrackedView | None = None
         self._turned_frames: list[int] = []
+        self._repeats: list[Frame] = []
         self._num_loose = 0
         self.num_lost = 0
         """Frames in a row in which the camera was not found, less one."""
@@ -89,6 +93,8 @@ class Slam:
 
     def process_frame(self, front: FrontEndFrame) -> SlamState:
         """One frame, from its curvature and flow to an adjusted map."""
+        if front.is_repeat and self.state is SlamState.TRACKING:
+            return self._pass_over(front.frame)
         self.take_adjustment()
         self._condense_when_due()
         with self.times.timed("track_extrema"):
@@ -101,6 +107,7 @@ class Slam:
             with self.times.timed("localize"):
                 T_cam_world = self._localize(front)
             self._refill_when_due(front)
+            self._place_repeats(front.frame.timestamp_ns, T_cam_world)
             if T_cam_world is not None:
                 with self.times.timed("map"):
                     self._map(front, T_cam_world)
@@ -108,6 +115,22 @@ class Slam:
         self._frame_count += 1
         self._newest_frame = front.frame.index
         return self.state
+
+    def _pass_over(self, frame: Frame) -> SlamState:
+        """A picture that repeats the one before waits for the next one to tell where the camera was meanwhile."""
+        self._repeats.append(replace(frame, image=frame.image[:0], color=None))
+        self._newest_frame = frame.index
+        return self.state
+
+    def _place_repeats(self, timestamp_ns: int, T_cam_world: Array | None) -> None:
+        """Repeated pictures lie on the way between the camera's places before and after them; with none after them, nowhere."""
+        repeats, self._repeats = self._repeats, []
+        if T_cam_world is None or not repeats:
+            return
+        before, since_ns = self.poses.newest(self.map), self.poses.newest_timestamp_ns
+        for frame in repeats:
+            share = (frame.timestamp_ns - since_ns) / max(1, timestamp_ns - since_ns)
+            self.poses.add_world(frame, between(before, T_cam_world, share), self.map)
 
     # --- tracking (Sec. 2) -------------------------------------------------------------------------------------
 
@@ -261,8 +284,9 @@ class Slam:
         self._end_tracks(ids[~found.is_inlier])
         if self._is_loose(ids[found.is_inlier]):
             return self._wait(front, found.T_cam_world)
+        if self._turned_frames:
+            self._end_turn(found.T_cam_world, self.map.points_world[ids[found.is_inlier]])
         self.state, self._num_doubts = SlamState.TRACKING, 0
-        self._turned_frames.clear()
         recovery = self.config.recovery
         if recovery.enabled and self._frame_count % recovery.interval == 0 and self._recover(front, found.T_cam_world):
             return self._relocalize(found.T_cam_world)
@@ -299,7 +323,23 @@ class Slam:
         self.poses.add_world(front.frame, T_cam_world, self.map)
         self._turned_frames.append(front.frame.index)
         self._directions.note(seen.ids, pixels, R, self.camera)
+        if self.config.recovery.enabled and self._frame_count % self.config.recovery.interval == 0:
+            self._recover(front, T_cam_world, self.config.relocalization.gate_px)
         return None
+
+    def _end_turn(self, T_cam_world: Array, points_world: Array) -> None:
+        """After a turn, with the camera found by landmarks (N, 3): the turn's frames lie on the way from where it was to where it is.
+
+        Where that is far for a turn they are given up. Where the camera was lost in between they stay where they are.
+        """
+        way = inverse(T_cam_world)[:3, 3] - inverse(self.poses.newest(self.map))[:3, 3]
+        depth = float(np.median(points_world @ T_cam_world[2, :3] + T_cam_world[2, 3]))
+        if self.state is SlamState.ROTATING and np.linalg.norm(way) > self.config.rotation.max_shift * depth:
+            self.poses.forget(self._turned_frames)
+        elif self.state is SlamState.ROTATING:
+            for k, index in enumerate(self._turned_frames, start=1):
+                self.poses.shift(index, k / (len(self._turned_frames) + 1) * way, self.map)
+        self._turned_frames.clear()
 
     def leave_turns_to(self, other: "Slam") -> None:
         """Frames of a turn that no landmark ended are those of the map that followed, where it has them."""
@@ -309,8 +349,10 @@ class Slam:
         """R_cam_world of a camera that turned on the spot; None where it did not, or seems to travel for a few frames."""
         directions = self._directions.of(seen.ids)
         turn = rotation_of(directions, pixels, seen.ages, R_before, self.camera, self.config.rotation)
-        self._num_doubts = self._num_doubts + 1 if turn is not None and turn.is_doubtful else 0
-        return None if turn is None or self._num_doubts > self.config.rotation.max_doubts else turn.R_cam_world
+        if turn is None or turn.share < self.config.rotation.min_share_in_map:
+            return None
+        self._num_doubts = self._num_doubts + 1 if turn.is_doubtful else 0
+        return None if self._num_doubts > self.config.rotation.max_doubts else turn.R_cam_world
 
     def _pose_of_votes(self, ids: Array, pixels: Array, T_prior: Array, seed: int = 0) -> Localization:
         """The pose by landmarks (N,) ids at ideal pixels (N, 2), those with many observations deciding."""
@@ -374,7 +416,7 @@ class Slam:
             T_cam_world = self._after_adjustment(T_cam_world)
             self._merge_landmarks(T_cam_world)
             keyframe = self._add_keyframe(front, T_cam_world)
-            triangulate_landmarks(self.map, self.camera, self.config.triangulation)
+            triangulate_landmarks(self.map, self.camera, self.config.triangulation, self.rigidity)
             if keyframe % self.config.bundle_adjustment.keyframe_interval == 0:
                 self._adjust_window()
             self._refine_calibration_when_due()
@@ -394,11 +436,23 @@ class Slam:
         return is_keyframe(self.map.obs_pixels[then[both]], now[both], int(count), gap, self.config.keyframes)
 
     def _add_keyframe(self, front: FrontEndFrame, T_cam_world: Array) -> int:
-        keyframe = add_view(self.map, TrackedView(front.frame, *self._seen(), self._image_motion), T_cam_world)
+        deviation = self._position_deviation_deg(T_cam_world)
+        keyframe = add_view(self.map, TrackedView(front.frame, *self._seen(), self._image_motion), T_cam_world, deviation)
         self._pending_frames[keyframe] = front.frame
         self._pending_frames.pop(keyframe - self._untaken, None)
         self._remembered.add(keyframe, front.frame)
         return keyframe
+
+    def _position_deviation_deg(self, T_cam_world: Array) -> float:
+        """Of the camera's place by the landmarks that vote and agree with it."""
+        seen, pixels = self._seen()
+        ids = seen.ids
+        mapped = np.flatnonzero(self.map.is_mapped(ids))
+        voting = mapped[voters(self.map.num_observations[ids[mapped]], self.config.localization)]
+        points = self.map.points_world[ids[voting]]
+        errors = reprojection_errors(T_cam_world, points, pixels[voting], self.camera.intrinsics)
+        agrees = errors < self.config.localization.outlier_px
+        return position_deviation_deg(points[agrees] @ T_cam_world[:3, :3].T + T_cam_world[:3, 3], errors[agrees], self.camera)
 
     def _merge_landmarks(self, T_cam_world: Array) -> None:
         """Landmarks that met tracked ones since the last keyframe and are the same become one, the older."""
@@ -502,6 +556,8 @@ class Slam:
 
     def finish(self) -> None:
         """The adjustment of the whole map at the end of a recording; the poses of all frames move along."""
+        if self._repeats:
+            self._place_repeats(self._repeats[-1].timestamp_ns, self.poses.newest(self.map))  # and the camera rests, for all that is known
         final = self.config.final_adjustment
         if not final.enabled or not 2 < self.map.num_keyframes <= final.max_keyframes:
             return

@@ -11,6 +11,7 @@ from vitamin3d.atlas import Atlas
 from vitamin3d.config import AtlasConfig, Config
 from vitamin3d.geometry.camera import Camera
 from vitamin3d.geometry.sim3_alignment import align_sim3
+from vitamin3d.mapping.landmark_triangulation import Rigidity
 from vitamin3d.mapping.window_adjustment import AdjustAtOnce
 from vitamin3d.slam import IDS_PER_MAP
 from vitamin3d.tracking.front_end import FrontEnd
@@ -171,6 +172,107 @@ def test_nothing_but_black_or_one_picture_is_no_map(demo, plain):
         assert atlas.ranked() == [] and len(atlas.notes) == len(pictures) and atlas.adjustments_awaited == 0
         atlas.finish()
         assert atlas.take_settled_keyframes(everything=True) == []
+
+
+# --- maps that are false ---------------------------------------------------------------------------------------------
+
+RIGID, FALSE = Rigidity(100_000, 60_000), Rigidity(100_000, 20_000)
+
+
+def judged(demo, pictures, judgements, adjuster=None, config=None):
+    """An atlas of a film; after some frames the tracks of the current map are said to have been rigid or not."""
+    config = config or Config()
+    front_end, atlas, numbers = FrontEnd(config), Atlas(demo.camera, config), []
+    atlas.use_adjuster(adjuster or AdjustAtOnce())
+    for index, picture in enumerate(pictures):
+        atlas.process_frame(front_end.process(Frame(index, index * PERIOD_NS, picture)))
+        numbers.append(atlas.current.number)
+        if index in judgements:
+            atlas.current.rigidity = dataclasses.replace(judgements[index])
+    return atlas, numbers
+
+
+def test_tracks_of_a_rigid_scene_agree_with_its_map(cut, dark):
+    for slam in (*cut[0].ranked(), *dark[0].ranked()):
+        assert slam.rigidity.num_tracks > 300 and slam.rigidity.share > 0.5
+
+
+def test_a_false_map_is_dropped_and_made_anew(demo, plain):
+    atlas, numbers = judged(demo, plain[:110], {39: RIGID, 49: FALSE})
+    (slam,) = atlas.ranked()
+    assert numbers == [0] * 50 + [1] * 60 and atlas.active is slam and slam.number == 1
+    assert atlas.left == [] and atlas.successor is None
+    assert min(frames_of(slam, 110)) >= 50 and len(frames_of(slam, 110)) > 50
+    assert path_error(slam, demo, range(110)) < 0.01
+    assert atlas.notes[50].state is SlamState.INITIALIZING and atlas.notes[-1].state is SlamState.TRACKING
+    assert all(taken is slam for taken, _, _ in atlas.take_settled_keyframes(everything=True))
+
+
+def test_a_map_is_judged_by_many_tracks_and_by_less_than_the_least_share(demo, plain):
+    atlas_config = Config().atlas
+    few, least = Rigidity(atlas_config.judged_tracks - 1, 0), Rigidity(1000, round(1000 * atlas_config.min_rigid_share))
+    just_below = Rigidity(atlas_config.judged_tracks, int(atlas_config.min_rigid_share * atlas_config.judged_tracks) - 1)
+    for judgement, is_dropped in ((few, False), (least, False), (just_below, True)):
+        assert judged(demo, plain[:42], {40: judgement})[1][-1] == int(is_dropped), judgement
+
+
+def test_keyframes_of_a_false_map_are_not_handed_over(demo, plain):
+    soon = dataclasses.replace(Config(), window=dataclasses.replace(Config().window, settled_keyframes=2))
+    for judgement, is_false in ((FALSE, True), (RIGID, False)):
+        atlas, _ = judged(demo, plain[:60], {59: judgement}, config=soon)
+        assert atlas.active.number == 0 and (atlas.take_settled_keyframes() == []) == is_false
+
+
+def test_a_false_successor_is_made_anew_and_the_older_map_stays(demo, plain, flipped):
+    atlas, numbers = judged(demo, plain[:70] + flipped[70:], {90: FALSE})  # while the camera is sought in the older one too
+    assert [note.state for note in atlas.notes[90:93]] == [SlamState.TRACKING, SlamState.INITIALIZING, SlamState.INITIALIZING]
+    assert numbers[70:91] == [1] * 21 and numbers[92:] == [2] * 58
+    earlier, later = sorted(atlas.ranked(), key=lambda slam: slam.number)
+    assert (earlier.number, later.number) == (0, 2) and atlas.left == [earlier] and min(frames_of(later, 150)) > 90
+    assert max(path_error(slam, demo, range(150)) for slam in (earlier, later)) < 0.01
+
+
+def test_a_false_map_is_neither_left_behind_nor_inherited_from(demo, plain):
+    wrong = dataclasses.replace(demo.camera, fx=1.02 * demo.camera.fx, fy=1.02 * demo.camera.fy)
+    atlas, _ = judged(demo, plain[:60], {})
+    atlas.active.camera, atlas.active.rigidity = wrong, dataclasses.replace(FALSE)
+    atlas.process_frame(FrontEnd(Config()).process(Frame(60, 60 * PERIOD_NS, plain[60])))
+    assert atlas.active.number == 1 and atlas.active.camera == demo.camera and atlas.left == []
+
+
+class Late:
+    """Adjusts at once, and gives the result when it is waited for or after it was asked a few times."""
+
+    def __init__(self):
+        self.result, self.asked = None, 0
+
+    @property
+    def is_busy(self):
+        return self.result is not None
+
+    def begin(self, task):
+        assert not self.is_busy, "one thing at a time"
+        self.result, self.asked = task(), 0
+
+    def take(self, wait=False):
+        self.asked += 1
+        if self.result is None or not (wait or self.asked > 2):
+            return None
+        result, self.result = self.result, None
+        return result
+
+
+def test_a_false_map_takes_its_adjustment_with_it(demo, plain):
+    """In live runs a window is being adjusted beside the tracking when its map is dropped: the next map must not get it."""
+    first, _ = judged(demo, plain[:50], {}, Late())
+    adjusted = first.active.map.frame_indices[Config().bundle_adjustment.keyframe_interval]
+    adjuster = Late()
+    judged(demo, plain[: adjusted + 1], {}, adjuster)
+    assert adjuster.is_busy
+    atlas, numbers = judged(demo, plain[:90], {adjusted: FALSE}, Late())
+    (slam,) = atlas.ranked()
+    assert numbers[adjusted : adjusted + 2] == [0, 1] and slam.number == 1
+    assert path_error(slam, demo, range(90)) < 0.01
 
 
 # --- poses that hang on little ---------------------------------------------------------------------------------------

@@ -98,7 +98,7 @@ def test_it_can_be_switched_off(rng):
 
 def test_a_turn_is_doubtful_where_the_older_tracks_agree_less(rng):
     ages = rng.permutation(400)
-    for share, is_doubtful in ((0.0, False), (0.02, False), (0.2, True)):
+    for share, is_doubtful in ((0.0, False), (0.1, False), (0.5, True)):
         directions, pixels, _ = sky(rng, np.eye(3))
         pixels[(ages >= 200) & (rng.random(400) < share)] += [8.0, 0.0]
         assert rotation_of(directions, pixels, ages, np.eye(3), PINHOLE, CONFIG).is_doubtful == is_doubtful, share
@@ -206,10 +206,11 @@ def test_a_chain_gives_the_poses_relative_to_the_reference():
 
 def test_a_chain_ends_at_the_reference_after_several_doubts_in_a_row():
     turns, parallax = chain(), CONFIG.max_parallax_deg
-    for deg in (parallax + 0.1, parallax + 0.1, parallax, parallax + 0.1, 5.0):  # never three in a row
+    doubts = [parallax + 0.1] * (CONFIG.max_doubts - 1)  # never as many in a row as end it
+    for deg in (*doubts, parallax, *doubts[1:], 5.0):
         turns.judge(deg, 12, CONFIG)
     assert len(turns.since(12)) == 6 and not turns.ended_before(100)
-    turns.judge(0.3, 13, CONFIG)
+    turns.judge(parallax + 0.1, 13, CONFIG)
     assert [kept.index for kept, _ in turns.since(12)] == [10, 11, 12, 13]
     assert (turns.ended_before(13), turns.ended_before(14)) == (False, True)
     turns.add(frame(16), rotation(0.0, 50.0, 0.0))

@@ -72,6 +72,15 @@ def inverse(T_a_b: Array) -> Array:
     return T_b_a
 
 
+def between(T_cam_world_0: Array, T_cam_world_1: Array, share: float) -> Array:
+    """T_cam_world (4, 4) at a share of the way from one camera to another: the centre goes straight, the rotation evenly."""
+    centre_0, centre_1 = (inverse(T)[:3, 3] for T in (T_cam_world_0, T_cam_world_1))
+    T = np.eye(4)
+    T[:3, :3] = exp_so3(share * log_so3(T_cam_world_1[:3, :3] @ T_cam_world_0[:3, :3].T)) @ T_cam_world_0[:3, :3]
+    T[:3, 3] = -T[:3, :3] @ ((1.0 - share) * centre_0 + share * centre_1)
+    return T
+
+
 def transform_points(T_a_b: Array, points_b: Array) -> Array:
     """Points (N, 3) of frame b in frame a."""
     return np.asarray(points_b @ T_a_b[:3, :3].T + T_a_b[:3, 3])

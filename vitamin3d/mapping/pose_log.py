@@ -43,15 +43,26 @@ class PoseLog:
         """Takes frames out of the log."""
         for index in frame_indices:
             self._frames.view[self._row_of_frame.pop(index)] = -1
+        self._last = [index for index in self._last if index in self._row_of_frame] or sorted(self._row_of_frame)[-1:]
 
     def pose(self, frame_index: int, sparse_map: SparseMap) -> Array:
         """T_cam_world (4, 4) of a logged frame as the map stands now."""
         row = self._row_of_frame[frame_index]
         return np.asarray(self._T_cam_keyframe.view[row] @ sparse_map.T_cam_world[self._keyframes.view[row]])
 
+    def shift(self, frame_index: int, offset_world: Array, sparse_map: SparseMap) -> None:
+        """Moves the camera of a logged frame by an offset (3,) in the world."""
+        row, R_cam_world = self._row_of_frame[frame_index], self.pose(frame_index, sparse_map)[:3, :3]
+        self._T_cam_keyframe.view[row, :3, 3] -= R_cam_world @ offset_world
+
     def newest(self, sparse_map: SparseMap) -> Array:
         """T_cam_world (4, 4) of the frame logged last."""
         return self.pose(self._last[-1], sparse_map)
+
+    @property
+    def newest_timestamp_ns(self) -> int:
+        """Of the frame logged last."""
+        return int(self._stamps.view[self._row_of_frame[self._last[-1]]])
 
     def predict(self, sparse_map: SparseMap) -> Array:
         """T_cam_world (4, 4) of the next frame, moving on as between the last two."""

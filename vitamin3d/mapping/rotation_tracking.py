@@ -99,6 +99,8 @@ class Turn:
     """(3, 3)."""
     is_doubtful: bool
     """Older tracks agree with it less often: the camera may be travelling."""
+    share: float
+    """Of the tracks, that agree with it."""
 
 
 def rotation_of(directions: Array, pixels: Array, ages: Array, R_before: Array, camera: Camera, config: RotationConfig) -> Turn | None:
@@ -110,9 +112,10 @@ def rotation_of(directions: Array, pixels: Array, ages: Array, R_before: Array, 
     directions, rays, ages = directions[known], unit_rays(pixels[known], camera), ages[known]
     if len(rays) < config.min_tracks or not config.enabled:
         return None
-    sigma = config.sigma_px / camera.fx
+    sigma = max(config.sigma_px / camera.fx, np.radians(config.sigma_deg))
     R = fit_rotation(directions, rays, R_before, sigma)
     agrees = turned_by(directions, rays, R) < INLIER_SIGMAS * sigma
     is_old = ages >= np.median(ages)
     enough = agrees.sum() >= config.min_tracks and agrees.mean() >= config.min_share
-    return Turn(R, bool(agrees[is_old].mean() < config.min_old_share * agrees.mean())) if enough else None
+    share = float(agrees.mean())
+    return Turn(R, bool(agrees[is_old].mean() < config.min_old_share * share), share) if enough else None
