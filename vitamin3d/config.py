@@ -81,7 +81,9 @@ class ExtremaConfig:
     significance: float = 5.0
     """Deviations of the noise by which gradient and bend of a maximum stand above it, 0: any;"""
     significant_wanted: int = 1000
-    """where fewer maxima do, the most significant ones up to this number."""
+    """where fewer maxima do, the most significant ones up to this number,"""
+    significant_share: float = 0.35
+    """or this share of all, where that is more."""
     min_roundness: float = 0.65
     """4 det / trace² of kappa's Hessian at the maximum: on a ridge (0) it slides, on a round hill (1) it stays; 0: all maxima."""
     max_tracks: int = 9000

@@ -116,7 +116,7 @@ def test_contrast_that_noise_shares_does_not_change_it(rng):
 
 
 def chosen(values, **settings):
-    return is_significant(np.asarray(values), dataclasses.replace(CONFIG, **settings))
+    return is_significant(np.asarray(values), dataclasses.replace(CONFIG, **{"significant_share": 0.0, **settings}))
 
 
 def test_where_enough_maxima_are_significant_exactly_those_are_kept(rng):
@@ -136,6 +136,13 @@ def test_where_fewer_are_the_best_are_kept_up_to_the_number_wanted(rng):
     assert chosen(values[:20], significance=5.0, significant_wanted=3000).all() and chosen([]).shape == (0,)
 
 
+def test_of_many_maxima_a_share_is_kept(rng):
+    values = rng.uniform(0, 10, 3000)
+    assert chosen(values, significance=9.9999, significant_wanted=100, significant_share=0.3).sum() == 900
+    assert chosen(values, significance=9.9999, significant_wanted=1200, significant_share=0.3).sum() == 1200
+    assert chosen(values, significance=0.1, significant_wanted=100, significant_share=0.3).sum() == (values >= 0.1).sum()
+
+
 def test_where_none_are_wanted_none_but_the_significant_are_kept(rng):
     values = rng.uniform(0, 10, 300)
     np.testing.assert_array_equal(chosen(values, significance=5.0, significant_wanted=0), values >= 5.0)
@@ -153,7 +160,7 @@ def grainy():
 
 def found(frame, **settings):
     """The extrema of a picture, with floors so low that noise passes them."""
-    low = {"min_curvature": 0.15, "wanted": 10**6, "lowest_curvature": 1e-6, "noise_curvature": 0.0, "min_roundness": 0.0}
+    low = {"wanted": 10**6, "lowest_curvature": 1e-6, "noise_curvature": 0.0, "min_roundness": 0.0, "significant_share": 0.0}
     config = dataclasses.replace(Config(), extrema=ExtremaConfig(**(low | settings)))
     return FrontEnd(config).process(frame).extrema
 

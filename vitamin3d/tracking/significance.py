@@ -51,7 +51,8 @@ def significance(f: Array, kappa: Array, extrema: Array, sigma_px: float) -> Arr
 
 def is_significant(values: Array, config: ExtremaConfig) -> Array:
     """(E,) bool: which extrema of these significances become tracks; of few, the less certain ones too."""
-    if len(values) <= config.significant_wanted:
+    count = max(config.significant_wanted, int(config.significant_share * len(values)))
+    if len(values) <= count:
         return np.ones(len(values), np.bool_)
-    wanted = np.sort(values)[len(values) - config.significant_wanted] if config.significant_wanted else np.inf
+    wanted = np.sort(values)[len(values) - count] if count else np.inf
     return np.asarray(values >= min(config.significance, wanted))
