@@ -15,7 +15,7 @@ from vitamin3d.config import Config
 from vitamin3d.geometry.camera import Camera
 from vitamin3d.geometry.reprojection import reprojection_errors
 from vitamin3d.geometry.rolling_shutter import NO_MOTION, at_one_moment, fit_image_motion, ideal_pixels
-from vitamin3d.geometry.se3 import between, inverse
+from vitamin3d.geometry.se3 import between, inverse, transform_points
 from vitamin3d.mapping.calibration_refinement import CalibrationRefinement
 from vitamin3d.mapping.initialization_history import InitializationHistory, TrackedView
 from vitamin3d.mapping.keyframe_selection import is_keyframe
@@ -333,7 +333,7 @@ class Slam:
         Where that is far for a turn they are given up. Where the camera was lost in between they stay where they are.
         """
         way = inverse(T_cam_world)[:3, 3] - inverse(self.poses.newest(self.map))[:3, 3]
-        depth = float(np.median(points_world @ T_cam_world[2, :3] + T_cam_world[2, 3]))
+        depth = float(np.median(transform_points(T_cam_world, points_world)[:, 2]))
         if self.state is SlamState.ROTATING and np.linalg.norm(way) > self.config.rotation.max_shift * depth:
             self.poses.forget(self._turned_frames)
         elif self.state is SlamState.ROTATING:
@@ -452,7 +452,7 @@ class Slam:
         points = self.map.points_world[ids[voting]]
         errors = reprojection_errors(T_cam_world, points, pixels[voting], self.camera.intrinsics)
         agrees = errors < self.config.localization.outlier_px
-        return position_deviation_deg(points[agrees] @ T_cam_world[:3, :3].T + T_cam_world[:3, 3], errors[agrees], self.camera)
+        return position_deviation_deg(transform_points(T_cam_world, points[agrees]), errors[agrees], self.camera)
 
     def _merge_landmarks(self, T_cam_world: Array) -> None:
         """Landmarks that met tracked ones since the last keyframe and are the same become one, the older."""
