@@ -52,7 +52,14 @@ class Atlas:
             self.successor = None
             return state
         self.active.take_adjustment(wait=True)  # both maps may have one adjuster, and it does one thing at a time
-        return self._succeed(front)
+        return self._take_over() if self.active.heritage else self._succeed(front)
+
+    def _take_over(self) -> SlamState:
+        """A bent map ends for good: near the bend nothing in it is certain. Its newest frames and tracks are the next map's."""
+        bent, self.active = self.active, self._new_map()
+        self.left += [] if self._is_young(bent) else [bent]
+        self.active.succeed_to(bent)
+        return self.active.state
 
     def _succeed(self, front: FrontEndFrame) -> SlamState:
         """The frame in the successor, which becomes the active map when it has held for a while."""

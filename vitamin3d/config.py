@@ -36,6 +36,8 @@ AT_LEAST_ONE = (
     "extrema_tracking.flow_patch",
     "extrema_tracking.flow_stride",
     "initialization.history",
+    "motion_check.interval",
+    "motion_check.max_frames",
     "recovery.interval",
     "bundle_adjustment.keyframe_interval",
     "window.keyframes",
@@ -120,14 +122,16 @@ class ExtremaTrackingConfig:
     prediction_sigma_px: float = 3.0
     """sigma of w in Eq. 5."""
     max_steps: int = 10
-    flow_octave: int = 1
+    flow_octave: int = 2
     """The finest octave of the dense flow: 0 the picture's own pixels, 1 half of them in each direction, ..."""
-    flow_patch: int = 16
+    flow_patch: int = 12
     """Side of the patches that the dense flow is found by, pixels of a reduced picture of 376 × 240, in others in proportion; large ones
     slide less along edges and follow noise less,"""
-    flow_stride: int = 12
+    flow_stride: int = 6
     """and their distance."""
-    flow_blur_px: float = 1.0
+    flow_refinements: int = 5
+    """Variational steps at each octave, after the patches: between them the flow is smooth, and follows the edges."""
+    flow_blur_px: float = 1.25
     """Deviation of the blur of the reduced pictures before the flow is computed."""
     gate_px: float = 1.05
     """A climb that ends farther from the prediction is a miss: where the flow is exact, a far extremum is another one."""
@@ -152,6 +156,10 @@ class ContinuityConfig:
     """Grey levels on the grid; a picture with less shows nothing (a covered lens)."""
     good_correlation: float = 0.97
     """Below it the flow is tried once more, beginning with a homography of matched corners: large steps, dropped pictures."""
+    large_step: float = 0.02
+    """Median flow, in sizes of the picture (square root of its area), above which that is tried as well;"""
+    largest_step: float = 0.15
+    """and above which a flow that no corners confirm is none."""
     min_correlation: float = 0.6
     """Below it the picture goes on from another one, or from none: a cut, a stray picture."""
     max_gap: int = 90
@@ -266,6 +274,38 @@ class TriangulationConfig:
     """Of all its observations in the last `checked_keyframes`; 0: the first and the newest alone are looked at."""
     checked_keyframes: int = 40
     min_observations: int = 2
+
+
+@dataclass(frozen=True)
+class MotionCheckConfig:
+    """The map's newest motion against the one that the tracks of two of its keyframes tell by themselves. Not in the paper.
+
+    A map may be bent, all its landmarks agreeing with false poses; no adjustment leaves such a minimum.
+    """
+
+    enabled: bool = True
+    interval: int = 4
+    """Keyframes between two checks."""
+    max_keyframes: int = 24
+    """Between the two that are compared,"""
+    min_pairs: int = 50
+    """with so many landmarks seen in both,"""
+    min_share: float = 0.25
+    """and this share of those seen in the newest."""
+    sigma_px: float = 1.0
+    """Of the Geman–McClure cost of the epipolar distances."""
+    sound_ratio: float = 1.2
+    """The map's cost over the least; up to here the map is sound,"""
+    bent_ratio: float = 1.8
+    """from here on bent, where its motion differs from the best"""
+    min_turn_deg: float = 1.0
+    """by so much in rotation"""
+    min_direction_deg: float = 15.0
+    """or so much in the direction of the way,"""
+    max_doubts: int = 1
+    """in more than so many checks since the last sound one."""
+    max_frames: int = 60
+    """The newest frames that a map that follows a bent one may begin with."""
 
 
 @dataclass(frozen=True)
@@ -677,6 +717,7 @@ class Config:
     localization: LocalizationConfig = field(default_factory=LocalizationConfig)
     rotation: RotationConfig = field(default_factory=RotationConfig)
     keyframes: KeyframeConfig = field(default_factory=KeyframeConfig)
+    motion_check: MotionCheckConfig = field(default_factory=MotionCheckConfig)
     triangulation: TriangulationConfig = field(default_factory=TriangulationConfig)
     recovery: RecoveryConfig = field(default_factory=RecoveryConfig)
     relocalization: RelocalizationConfig = field(default_factory=RelocalizationConfig)

@@ -38,6 +38,7 @@ class Cause(Enum):
     TURNING = "turning"
     STANDING = "standing"
     TOO_SHORT = "too short"
+    BENT = "bent"
     MOVING = "moving"
     LOST = "lost"
 
@@ -70,6 +71,10 @@ TEXTS = {
     Cause.TURNING: (f"the camera turns but does not travel{NO_DEPTH}", "move sideways while turning"),
     Cause.STANDING: (f"the camera stands still{NO_DEPTH}", "move sideways, or leave this part out"),
     Cause.TOO_SHORT: ("tracked in a map that was lost when young and dropped", "film this part slower and longer, with more overlap"),
+    Cause.BENT: (
+        "tracked, but the map had bent since and was cut back: the pictures' own motion was another one",
+        "keep things near and far in view in turns and doorways, and film them slower",
+    ),
     Cause.MOVING: ("too much moves by itself: the scene is not rigid", "keep what moves small in the picture, or film without it"),
     Cause.LOST: ("lost: the landmarks were not found again", "film slower and with more overlap, or come back to what was seen before"),
 }
@@ -130,8 +135,8 @@ def _causes(notes: Sequence[FrameNote], width_px: float) -> list[Cause]:
 def _causes_in_time(notes: Sequence[FrameNote], width_px: float, in_map: Array) -> list[Cause]:
     """As `_causes`, with what only frames before and after tell; `in_map` (N,) says which are localised.
 
-    Where a map began and was dropped, so it was for the frames before it. After a break, until one is localised, frames are of
-    something else; and so are those before the last break that comes before the first map.
+    Where a map began and was dropped, so it was for the frames before it; where it was kept, it was cut back there. After a break, until
+    one is localised, frames are of something else; and so are those before the last break that comes before the first map.
     """
     kept = {note.map_number for note, is_in in zip(notes, in_map, strict=True) if is_in}
     dropped = {note.map_number for note in notes if note.state.is_tracked} - kept
@@ -142,7 +147,9 @@ def _causes_in_time(notes: Sequence[FrameNote], width_px: float, in_map: Array) 
         is_cut_off = begin >= 0 and not in_map[k] and (is_cut_off or cause is Cause.OTHER_PICTURE)
         if (is_cut_off or k < last_break) and cause in OF_A_BREAK:
             cause = Cause.OTHER_PICTURE
-        causes.append(Cause.TOO_SHORT if cause is Cause.LOST and notes[k].map_number in dropped else cause)
+        if cause is Cause.LOST and notes[k].map_number in dropped:
+            cause = Cause.TOO_SHORT
+        causes.append(Cause.BENT if cause is Cause.TOO_SHORT and notes[k].map_number in kept else cause)
     return causes
 
 

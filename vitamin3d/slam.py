@@ -1,6 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """Tracking, localisation and mapping on one page (Fig. 2a–b of the paper): `Slam.process_frame`, top to bottom."""
 
+from collections import deque
 from dataclasses import replace
 
 import numpy as np
@@ -22,8 +23,9 @@ from vitamin3d.mapping.keyframe_selection import is_keyframe
 from vitamin3d.mapping.landmark_recovery import recover_landmarks, same_landmarks
 from vitamin3d.mapping.landmark_statistics import UnitInformation, keyframe_vertices
 from vitamin3d.mapping.landmark_triangulation import Rigidity, triangulate_landmarks
-from vitamin3d.mapping.map_condensation import condense, is_due
+from vitamin3d.mapping.map_condensation import Condensation, condense, is_due
 from vitamin3d.mapping.map_initialization import add_view, build_first_map
+from vitamin3d.mapping.motion_check import MotionCheck
 from vitamin3d.mapping.p3p_localization import localize, localize_by, voters
 from vitamin3d.mapping.pose_deviation import position_deviation_deg
 from vitamin3d.mapping.pose_log import PoseLog
@@ -65,6 +67,10 @@ class Slam:
         self._history = InitializationHistory(config.initialization)
         self._pending_frames: dict[int, Frame] = {}
         self._directions, self._turns, self._num_doubts = Directions(), Turns(), 0
+        self._motion_check = MotionCheck(config.motion_check)
+        self._recent: deque[TrackedView] = deque(maxlen=config.motion_check.max_frames)
+        self.heritage: list[TrackedView] = []
+        """Of a map that was bent: the frames since its last sound keyframe, for the map that follows."""
         self._remembered = RememberedKeyframes(config.relocalization)
         self._untaken = max(UNTAKEN_KEYFRAMES, UNTAKEN_WINDOWS * config.window.keyframes)
         self._begins_the_run = True
@@ -110,6 +116,7 @@ class Slam:
             self._place_repeats(front.frame.timestamp_ns, T_cam_world)
             if T_cam_world is not None:
                 with self.times.timed("map"):
+                    self._recent.append(TrackedView(front.frame, *self._seen(), self._image_motion))
                     self._map(front, T_cam_world)
                     self._directions.note(*self._seen_ids(), self.poses.newest(self.map)[:3, :3], self.camera)
         self._frame_count += 1
@@ -215,6 +222,20 @@ class Slam:
             self._history.append(aside)
         self._turn_on(front.frame)
         self._history.append(view)
+        self._begin_map()
+
+    def succeed_to(self, bent: "Slam") -> None:
+        """Goes on with the tracks of a map that was bent, from its keyframes since it was sound; at once, if these make a map."""
+        self._newest_frame, self._last_ns = bent._newest_frame, bent._last_ns
+        self._next_id = 1 + max(int(view.tracks.ids.max(initial=0)) for view in bent.heritage)
+        for view in bent.heritage:
+            self._history.append(view)
+        self.tracks, self._image_motion = bent.heritage[-1].tracks, bent.heritage[-1].image_motion
+        bent.heritage = []
+        self._begin_map()
+
+    def _begin_map(self) -> None:
+        """From the newest frame and the oldest that shares tracks with it, where they show parallax."""
         ids, pixels_0, pixels_1 = self._history.pair()
         if not self._history.is_worth_a_try(pixels_0, pixels_1):
             return
@@ -421,9 +442,24 @@ class Slam:
                 self._adjust_window()
             self._refine_calibration_when_due()
             self.poses.add(front.frame, keyframe, np.eye(4))
+            if keyframe % self.config.motion_check.interval == 0 and self._motion_check.is_bent(self.map, self.camera):
+                self._retreat(self._motion_check.last_sound)
         else:
             T_cam_world = self._adjust_with_frame(T_cam_world)
             self.poses.add_world(front.frame, T_cam_world, self.map)
+
+    def _retreat(self, keyframe: int) -> None:
+        """Forgets all since a keyframe, which the map that follows inherits; the camera is lost in this one."""
+        self.take_adjustment(wait=True)
+        self.heritage = [view for view in self._recent if view.frame.index >= self.map.frame_indices[keyframe]]
+        self._recent.clear()
+        if keyframe + 1 < self.map.num_keyframes:
+            self.poses.forget_since(self.map.frame_indices[keyframe + 1])
+        self.tracks, self._meetings = Tracks.empty(), []
+        kept_keyframes = np.arange(keyframe + 1)
+        sound, kept_ids = self.map.condensed(kept_keyframes, np.zeros(0, np.int64))
+        self._become(Condensation(sound, kept_keyframes, kept_ids))
+        self.state = SlamState.LOST
 
     def _is_keyframe(self, frame: Frame) -> bool:
         seen, pixels = self._seen()
@@ -503,18 +539,24 @@ class Slam:
         with self.times.timed("condense"):
             self.take_adjustment(wait=True)
             needed = np.concatenate([self.tracks.ids, *(pair.ravel() for pair in self._meetings)])
-            done = condense(self.map, np.unique(needed), self._untaken, self.config.memory)
-            self.poses.move_to(done.kept_keyframes, self.map)
-            born = self.unique_ids(np.append(done.kept_ids, self._next_id)) - self.number * IDS_PER_MAP
-            self._unique_ids, self._num_forgotten = born[:-1], int(born[-1]) - len(done.kept_ids)
-            renamed = np.searchsorted(done.kept_ids, self.tracks.ids)
-            self.tracks = replace(self.tracks, ids=renamed)
-            self._meetings = [np.searchsorted(done.kept_ids, pair) for pair in self._meetings]
-            self._pending_frames = {int(np.searchsorted(done.kept_keyframes, k)): f for k, f in self._pending_frames.items()}
-            self._directions = self._directions.renamed(done.kept_ids)
-            self._remembered.move_to(done.kept_keyframes)
-            self._past.forget()
-            self.map, self._next_id, self._num_condensed = done.map, len(done.kept_ids), len(done.kept_ids)
+            self._become(condense(self.map, np.unique(needed), self._untaken, self.config.memory))
+            self._recent.clear()  # their tracks have other ids
+
+    def _become(self, done: Condensation) -> None:
+        """Takes a smaller map; ids and keyframes are numbered anew."""
+        self.poses.move_to(done.kept_keyframes, self.map)
+        born = self.unique_ids(np.append(done.kept_ids, self._next_id)) - self.number * IDS_PER_MAP
+        self._unique_ids, self._num_forgotten = born[:-1], int(born[-1]) - len(done.kept_ids)
+        renamed = np.searchsorted(done.kept_ids, self.tracks.ids)
+        self.tracks = replace(self.tracks, ids=renamed)
+        self._meetings = [np.searchsorted(done.kept_ids, pair) for pair in self._meetings]
+        is_kept = np.isin(np.arange(self.map.num_keyframes), done.kept_keyframes)
+        self._pending_frames = {int(np.searchsorted(done.kept_keyframes, k)): f for k, f in self._pending_frames.items() if is_kept[k]}
+        self._directions = self._directions.renamed(done.kept_ids)
+        self._remembered.move_to(done.kept_keyframes)
+        self._motion_check.move_to(done.kept_keyframes)
+        self._past.forget()
+        self.map, self._next_id, self._num_condensed = done.map, len(done.kept_ids), len(done.kept_ids)
 
     def unique_ids(self, ids: Array) -> Array:
         """The ids (N,) that tracks had at their birth, which the map's memory does not reuse."""

@@ -9,7 +9,7 @@ import pytest
 from scenes import texture, warped
 
 from vitamin3d.config import Config, ContinuityConfig
-from vitamin3d.tracking.continuity import FlowTracker, correlation, homography_flow, view_of
+from vitamin3d.tracking.continuity import FlowTracker, correlation, homography_flow, residual, step_of, view_of
 from vitamin3d.tracking.front_end import dense_flow_solver
 
 CONFIG = ContinuityConfig()
@@ -230,3 +230,43 @@ def test_the_homography_is_that_of_the_corners(scenes):
     np.testing.assert_allclose(flow[40:-40, 40:-40], x[..., :2] / x[..., 2:] - np.stack([u, v], axis=-1), atol=1.5)
     assert homography_flow(a, BLACK, CONFIG) is None and homography_flow(BLACK, a, CONFIG) is None
     assert homography_flow(a, at(scenes[1], 100), CONFIG) is None
+
+
+# --- which of two flows is the better one ------------------------------------------------------------------------------
+
+
+def test_the_step_is_in_sizes_of_the_picture():
+    flow = np.zeros((100, 400, 2), np.float32)
+    flow[..., 0], flow[..., 1] = 6.0, 8.0
+    assert step_of(flow) == pytest.approx(10.0 / 200.0)
+    assert step_of(np.repeat(np.repeat(flow, 2, axis=0), 2, axis=1) * 2) == pytest.approx(step_of(flow))  # at any resolution
+
+
+def test_the_residual_is_the_mean_difference_of_what_both_pictures_show(rng):
+    a, b = (rng.integers(0, 256, (12, 16)).astype(np.uint8) for _ in range(2))
+    flow = np.zeros((12, 16, 2), np.float32)
+    flow[..., 0], flow[..., 1] = 3.0, -2.0
+    pairs = [(a[v, u], b[v - 2, u + 3]) for v in range(2, 12) for u in range(13)]
+    assert residual(a, b, flow) == pytest.approx(np.mean([min(20, abs(int(x) - int(y))) for x, y in pairs]))
+    assert residual(a, a, np.zeros_like(flow)) == 0.0
+    assert residual(a, b, flow + 15.0) == np.inf  # nothing is in both
+
+
+@pytest.mark.parametrize("shift", [0.0, 0.01, 0.05])
+def test_corners_are_asked_where_the_step_is_large(scenes, shift, monkeypatch):
+    from vitamin3d.tracking import continuity
+
+    asked = []
+    monkeypatch.setattr(continuity, "homography_flow", lambda a, b, config: asked.append(shift) or homography_flow(a, b, config))
+    by = round(shift * np.sqrt(WIDTH * HEIGHT))
+    first, second = at(scenes[0], 0), at(scenes[0], by)
+    assert followed([first, second]) == [None, 0]
+    assert bool(asked) == (shift > CONFIG.large_step)
+
+
+def test_a_leap_that_no_corners_confirm_is_no_continuation(scenes):
+    """After a covered lens any flow may look a little like the next picture."""
+    first, second = at(scenes[0], 0), at(scenes[0], 60)
+    assert 60 / np.sqrt(WIDTH * HEIGHT) > CONFIG.largest_step
+    assert followed([first, second]) == [None, 0]
+    assert followed([first, second], min_matches=10_000) == [None, None]

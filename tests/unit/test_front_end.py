@@ -44,7 +44,8 @@ def test_large_patches_of_a_blurred_picture_follow_noise_less():
         replace(frame, image=np.clip(0.15 * frame.image + rng.normal(90, 8, frame.image.shape), 0, 255).astype(np.uint8))
         for frame in frames()
     ]
-    for settings in ({"flow_patch": 8, "flow_stride": 4, "flow_blur_px": 0.0}, {}):
+    small = {"flow_patch": 8, "flow_stride": 4, "flow_blur_px": 0.0, "flow_octave": 1, "flow_refinements": 0}
+    for settings in (small, {}):
         front_end = FrontEnd(replace(Config(), extrema_tracking=replace(Config().extrema_tracking, **settings)))
         flow = [front_end.process(frame) for frame in noisy][1].dense_flow
         errors.append(np.median(np.hypot(*np.moveaxis(Config().extrema_tracking.flow_reduction * flow[20:-20, 20:-20] - SHIFT, -1, 0))))
@@ -55,8 +56,8 @@ def test_large_patches_of_a_blurred_picture_follow_noise_less():
 @pytest.mark.parametrize(
     ("shape", "patch", "stride"),
     [
-        ((240, 376), 16, 12), ((376, 240), 16, 12), ((120, 188), 8, 6), ((180, 282), 12, 9),
-        ((60, 94), 4, 3), ((8, 8), 4, 1), ((540, 960), 16, 16), ((1080, 1920), 16, 16),
+        ((240, 376), 12, 6), ((376, 240), 12, 6), ((120, 188), 6, 3), ((180, 282), 9, 5),
+        ((60, 94), 4, 2), ((8, 8), 4, 1), ((540, 960), 16, 14), ((1080, 1920), 16, 16),
     ],
 )  # fmt: skip
 def test_the_patches_of_the_flow_go_with_the_picture_up_to_what_opencv_can_do(shape, patch, stride):
@@ -64,7 +65,8 @@ def test_the_patches_of_the_flow_go_with_the_picture_up_to_what_opencv_can_do(sh
     assert (quick.getPatchSize(), quick.getPatchStride()) == (patch, stride)
     assert patient.getPatchSize() == patch and patient.getPatchStride() == min(stride, patch // 2)  # they overlap by half
     assert patient.getGradientDescentIterations() > quick.getGradientDescentIterations()
-    assert quick.getFinestScale() == patient.getFinestScale() == 0
+    assert quick.getFinestScale() == patient.getFinestScale() == 1  # half of the reduced picture
+    assert quick.getVariationalRefinementIterations() == Config().extrema_tracking.flow_refinements > 0
 
 
 def test_settings_of_the_flow_are_taken_in_proportion():

@@ -150,6 +150,13 @@ def test_after_a_stray_scene_what_follows_it_is_of_something_else_too():
     assert (lost.cause, lost.num_frames, other.cause, other.num_frames) == (Cause.LOST, 10, Cause.OTHER_PICTURE, 10)
 
 
+def test_frames_that_a_map_was_cut_back_by_are_said_to_be_bent():
+    """They were tracked in a map that is kept, and are in it no more."""
+    cut_back = {"state": SlamState.TRACKING, "map_number": SEEN.get("map_number", 0)}
+    (gap,) = gaps_of((20, SEEN), (12, cut_back), (20, SEEN))
+    assert gap.cause is Cause.BENT and gap.num_frames == 12 and "cut back" in gap.sentence and "slower" in gap.remedy
+
+
 def test_frames_before_a_map_that_was_dropped_belong_to_it():
     dropped = {"state": SlamState.TRACKING, "map_number": 1}
     (gap,) = gaps_of((20, SEEN), (6, WAITING), (6, dropped), (20, SEEN))

@@ -6,6 +6,7 @@ motion; the least of the minima wins.
 """
 
 from itertools import product
+from typing import NamedTuple
 
 import numpy as np
 
@@ -44,11 +45,33 @@ def refine_essential(R: Array, t: Array, rays_0: Array, rays_1: Array, sigma: fl
         rays_0, rays_1: (N, 3) paired, z = 1, N >= 5.
         sigma: scale of the cost, in units of the focal length.
     """
+    motion = best_motion(R, t, rays_0, rays_1, sigma)
+    return np.asarray(skew(motion.t) @ motion.R)
+
+
+class Motion(NamedTuple):
+    """Of a camera from view 0 to view 1, up to the length of its way."""
+
+    R: Array
+    """(3, 3) of T_1_0."""
+    t: Array
+    """(3,) of T_1_0, of length 1."""
+    cost: float
+    """Geman–McClure, sum over the pairs."""
+
+
+def best_motion(R: Array, t: Array, rays_0: Array, rays_1: Array, sigma: float) -> Motion:
+    """The motion of least cost; arguments as of `refine_essential`."""
     some, starts = slice(None, None, -(-len(rays_0) // SEARCH_PAIRS)), np.vstack([t, DIRECTIONS])
     rotations, translations, costs = _descended(np.repeat(R[None], len(starts), axis=0), starts, rays_0[some], rays_1[some], sigma)
     best = [int(np.argmin(costs))]
-    rotations, translations, _ = _descended(rotations[best], translations[best], rays_0, rays_1, sigma)
-    return np.asarray(skew(translations[0]) @ rotations[0])
+    rotations, translations, costs = _descended(rotations[best], translations[best], rays_0, rays_1, sigma)
+    return Motion(rotations[0], translations[0], float(costs[0]))
+
+
+def motion_cost(R: Array, t: Array, rays_0: Array, rays_1: Array, sigma: float) -> float:
+    """The cost that `best_motion` lowers, of a motion with a translation (3,) of any length but 0."""
+    return float((_residuals(R, t / np.linalg.norm(t), rays_0, rays_1, sigma) ** 2).sum())
 
 
 def _descended(R: Array, t: Array, rays_0: Array, rays_1: Array, sigma: float) -> tuple[Array, Array, Array]:

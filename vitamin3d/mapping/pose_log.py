@@ -45,6 +45,10 @@ class PoseLog:
             self._frames.view[self._row_of_frame.pop(index)] = -1
         self._last = [index for index in self._last if index in self._row_of_frame] or sorted(self._row_of_frame)[-1:]
 
+    def forget_since(self, frame_index: int) -> None:
+        """Takes a frame and those after it out of the log."""
+        self.forget([index for index in self._row_of_frame if index >= frame_index])
+
     def pose(self, frame_index: int, sparse_map: SparseMap) -> Array:
         """T_cam_world (4, 4) of a logged frame as the map stands now."""
         row = self._row_of_frame[frame_index]

@@ -14,6 +14,8 @@ from vitamin3d.config import ContinuityConfig
 from vitamin3d.tracking.corners import described_corners, mutual_matches
 from vitamin3d.types import Array
 
+LARGEST_DIFFERENCE = 20
+"""Grey levels: what is hidden in one of the pictures says no more than that."""
 HOMOGRAPHY_PX, HOMOGRAPHY_ITERATIONS = 6.0, 500
 
 
@@ -80,6 +82,23 @@ def homography_flow(a: Array, b: Array, config: ContinuityConfig) -> Array | Non
     return flow.astype(np.float32) if np.isfinite(flow).all() and np.abs(flow).max() < 2 * a.shape[1] else None
 
 
+def step_of(flow: Array) -> float:
+    """Median length of a flow (h, w, 2), in sizes of the picture: square roots of its area."""
+    return float(np.median(np.hypot(*flow[::8, ::8].T)) / np.sqrt(flow.shape[0] * flow.shape[1]))
+
+
+def residual(a: Array, b: Array, flow: Array) -> float:
+    """Mean difference, grey levels, of a picture (h, w) uint8 from another, moved back by a flow (h, w, 2), where both are there."""
+    height, width = a.shape
+    u, v = np.meshgrid(np.arange(width, dtype=np.float32), np.arange(height, dtype=np.float32))
+    u, v = u + flow[..., 0], v + flow[..., 1]
+    inside = (u >= 0) & (v >= 0) & (u <= width - 1) & (v <= height - 1)
+    if inside.sum() < 0.1 * a.size:
+        return float("inf")
+    difference = cv2.absdiff(a, cv2.remap(b, u, v, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE))[inside]
+    return float(np.minimum(difference, LARGEST_DIFFERENCE).mean())
+
+
 class FlowTracker:
     """The flow to each picture from the one it continues; remembers the previous picture, and the last one before a break."""
 
@@ -124,12 +143,13 @@ class FlowTracker:
             return None
         flow = self._flow(a, b)
         plain = Continuation(flow, correlation(a.grid, b.grid, flow))
-        start = None if plain.correlation >= self.config.good_correlation else homography_flow(a.picture, b.picture, self.config)
+        is_easy = plain.correlation >= self.config.good_correlation and step_of(flow) <= self.config.large_step
+        start = None if is_easy else homography_flow(a.picture, b.picture, self.config)
         if start is None:
-            return plain
+            return plain if step_of(flow) <= self.config.largest_step else None
         flow = np.asarray(self._dis_from.calc(a.picture, b.picture, start))
         again = Continuation(flow, correlation(a.grid, b.grid, flow))
-        return again if again.correlation > plain.correlation else plain
+        return again if residual(a.picture, b.picture, again.flow) < residual(a.picture, b.picture, plain.flow) else plain
 
     def _flow(self, a: View, b: View) -> Array:
         return np.asarray(self._dis.calc(a.picture, b.picture, None))

@@ -31,6 +31,7 @@ def dense_flow_solver(config: Config, shape: tuple[int, int], patient: bool = Fa
     dis: cv2.DISOpticalFlow = cv2.DISOpticalFlow_create(cv2.DISOPTICAL_FLOW_PRESET_ULTRAFAST)  # type: ignore[attr-defined]
     dis.setFinestScale(max(0, settings.flow_octave - round(float(np.log2(settings.flow_reduction)))))
     dis.setGradientDescentIterations(2 * DESCENT_ITERATIONS if patient else DESCENT_ITERATIONS)
+    dis.setVariationalRefinementIterations(settings.flow_refinements)
     patch = min(LARGEST_PATCH_PX, max(LEAST_PATCH_PX, round(size * settings.flow_patch)))
     stride = min(patch, max(1, round(size * settings.flow_stride)))
     dis.setPatchSize(patch)
