@@ -224,12 +224,13 @@ def test_correlation_is_the_obvious_one_where_the_flow_stays_inside(rng):
 def test_the_homography_is_that_of_the_corners(scenes):
     a, H = at(scenes[0], 100), np.array([[1.05, 0.03, -30.0], [-0.02, 0.98, 12.0], [1e-4, -5e-5, 1.0]])
     b = cv2.warpPerspective(a, H, (WIDTH, HEIGHT))
+    a, b, black, other = (view_of(k, picture, CONFIG) for k, picture in enumerate((a, b, BLACK, at(scenes[1], 100))))
     flow = homography_flow(a, b, CONFIG)
     u, v = np.meshgrid(np.arange(40.0, WIDTH - 40), np.arange(40.0, HEIGHT - 40))
     x = np.stack([u, v, np.ones_like(u)], axis=-1) @ H.T
     np.testing.assert_allclose(flow[40:-40, 40:-40], x[..., :2] / x[..., 2:] - np.stack([u, v], axis=-1), atol=1.5)
-    assert homography_flow(a, BLACK, CONFIG) is None and homography_flow(BLACK, a, CONFIG) is None
-    assert homography_flow(a, at(scenes[1], 100), CONFIG) is None
+    assert homography_flow(a, black, CONFIG) is None and homography_flow(black, a, CONFIG) is None
+    assert homography_flow(a, other, CONFIG) is None
 
 
 # --- which of two flows is the better one ------------------------------------------------------------------------------

@@ -6,6 +6,7 @@ picture before, moved by the flow, then looks unlike this one on a coarse grid, 
 """
 
 from dataclasses import dataclass
+from functools import cached_property
 
 import cv2
 import numpy as np
@@ -28,6 +29,12 @@ class View:
     """(h, w) uint8, reduced."""
     grid: Array
     """(h / reduction, w / reduction) float32."""
+    num_corners: int
+
+    @cached_property
+    def corners(self) -> tuple[Array, Array]:
+        """Described corners of the picture, from `described_corners`."""
+        return described_corners(self.picture, self.num_corners)
 
     @property
     def contrast(self) -> float:
@@ -48,7 +55,7 @@ class Continuation:
 def view_of(index: int, picture: Array, config: ContinuityConfig) -> View:
     """A reduced picture (h, w) uint8 with its coarse grid."""
     size = max(1, picture.shape[1] // config.reduction), max(1, picture.shape[0] // config.reduction)
-    return View(index, picture, cv2.resize(picture, size, interpolation=cv2.INTER_AREA).astype(np.float32))
+    return View(index, picture, cv2.resize(picture, size, interpolation=cv2.INTER_AREA).astype(np.float32), config.corners)
 
 
 def correlation(a: Array, b: Array, flow: Array) -> float:
@@ -65,9 +72,9 @@ def correlation(a: Array, b: Array, flow: Array) -> float:
     return float((x * y).sum() / np.sqrt(max(1e-6, float((x * x).sum()) * float((y * y).sum()))))
 
 
-def homography_flow(a: Array, b: Array, config: ContinuityConfig) -> Array | None:
-    """Flow (h, w, 2) float32 by the homography of matched corners of two pictures (h, w) uint8; None where few agree on one."""
-    (points_a, words_a), (points_b, words_b) = (described_corners(picture, config.corners) for picture in (a, b))
+def homography_flow(a: View, b: View, config: ContinuityConfig) -> Array | None:
+    """Flow (h, w, 2) float32 by the homography of matched corners of two pictures (h, w); None where few agree on one."""
+    (points_a, words_a), (points_b, words_b) = a.corners, b.corners
     pairs = mutual_matches(words_a, words_b)
     if len(pairs) < config.min_matches:
         return None
@@ -75,11 +82,12 @@ def homography_flow(a: Array, b: Array, config: ContinuityConfig) -> Array | Non
     H, agrees = cv2.findHomography(x, y, cv2.RANSAC, HOMOGRAPHY_PX, maxIters=HOMOGRAPHY_ITERATIONS)
     if H is None or agrees.sum() < config.min_matches:
         return None
-    u, v = np.meshgrid(np.arange(a.shape[1], dtype=np.float64), np.arange(a.shape[0], dtype=np.float64))
+    height, width = a.picture.shape
+    u, v = np.meshgrid(np.arange(width, dtype=np.float64), np.arange(height, dtype=np.float64))
     moved = np.stack([u, v, np.ones_like(u)], axis=-1) @ H.T
     with np.errstate(divide="ignore", invalid="ignore"):
         flow = moved[..., :2] / moved[..., 2:] - np.stack([u, v], axis=-1)
-    return flow.astype(np.float32) if np.isfinite(flow).all() and np.abs(flow).max() < 2 * a.shape[1] else None
+    return flow.astype(np.float32) if np.isfinite(flow).all() and np.abs(flow).max() < 2 * width else None
 
 
 def step_of(flow: Array) -> float:
@@ -144,7 +152,7 @@ class FlowTracker:
         flow = self._flow(a, b)
         plain = Continuation(flow, correlation(a.grid, b.grid, flow))
         is_easy = plain.correlation >= self.config.good_correlation and step_of(flow) <= self.config.large_step
-        start = None if is_easy else homography_flow(a.picture, b.picture, self.config)
+        start = None if is_easy else homography_flow(a, b, self.config)
         if start is None:
             return plain if step_of(flow) <= self.config.largest_step else None
         flow = np.asarray(self._dis_from.calc(a.picture, b.picture, start))
