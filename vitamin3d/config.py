@@ -356,7 +356,7 @@ class AtlasConfig:
 
     min_keyframes: int = 5
     """A map that is lost with fewer, or with fewer frames localised, is dropped and made anew."""
-    min_frames: int = 15
+    min_frames: int = 10
     min_rigid_share: float = 0.25
     """And one in which fewer of the tracks that show parallax become landmarks: it may be that of something that moves, or of a turn;"""
     judged_tracks: int = 500

@@ -265,6 +265,17 @@ def test_corners_are_asked_where_the_step_is_large(scenes, shift, monkeypatch):
     assert bool(asked) == (shift > CONFIG.large_step)
 
 
+def test_where_the_exposure_changed_too_the_flow_that_looks_alike_is_taken(scenes):
+    """A flow that finds the place and one that does not differ little in grey levels then."""
+    first, second = at(scenes[0], 0), (0.55 * at(scenes[0], 110) + 30).astype(np.uint8)
+    flows = tracker()
+    assert followed([first, second], flows)[1] == 0
+    flow = tracker()
+    flow.follow(0, first)
+    found = flow.follow(1, second)[0]
+    assert np.median(np.abs(found[20:-20, 130:-20] - (-110.0, 0.0))) < 1.5
+
+
 def test_a_leap_that_no_corners_confirm_is_no_continuation(scenes):
     """After a covered lens any flow may look a little like the next picture."""
     first, second = at(scenes[0], 0), at(scenes[0], 60)

@@ -65,7 +65,7 @@ def test_the_patches_of_the_flow_go_with_the_picture_up_to_what_opencv_can_do(sh
     assert (quick.getPatchSize(), quick.getPatchStride()) == (patch, stride)
     assert patient.getPatchSize() == patch and patient.getPatchStride() == min(stride, patch // 2)  # they overlap by half
     assert patient.getGradientDescentIterations() > quick.getGradientDescentIterations()
-    assert quick.getFinestScale() == patient.getFinestScale() == 1  # half of the reduced picture
+    assert quick.getFinestScale() == 1 and patient.getFinestScale() == 0  # half of the reduced picture, and all of it
     assert quick.getVariationalRefinementIterations() == Config().extrema_tracking.flow_refinements > 0
 
 

@@ -155,9 +155,12 @@ class FlowTracker:
         start = None if is_easy else homography_flow(a, b, self.config)
         if start is None:
             return plain if step_of(flow) <= self.config.largest_step else None
-        flow = np.asarray(self._dis_from.calc(a.picture, b.picture, start))
+        is_explained = plain.correlation >= self.config.good_correlation
+        flow = np.asarray((self._dis if is_explained else self._dis_from).calc(a.picture, b.picture, start))
         again = Continuation(flow, correlation(a.grid, b.grid, flow))
-        return again if residual(a.picture, b.picture, again.flow) < residual(a.picture, b.picture, plain.flow) else plain
+        if not is_explained:  # the exposure may differ
+            return max(plain, again, key=lambda found: found.correlation)
+        return min(plain, again, key=lambda found: residual(a.picture, b.picture, found.flow))
 
     def _flow(self, a: View, b: View) -> Array:
         return np.asarray(self._dis.calc(a.picture, b.picture, None))

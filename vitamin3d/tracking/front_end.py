@@ -26,10 +26,11 @@ IDENTITY_FLOW = DominantFlow(np.eye(2), np.zeros(2), 0.0)
 
 
 def dense_flow_solver(config: Config, shape: tuple[int, int], patient: bool = False) -> cv2.DISOpticalFlow:
-    """OpenCV's DIS at the settings' size, for reduced pictures of this shape (h, w); a patient one takes three times as long."""
+    """OpenCV's DIS at the settings' size, for reduced pictures of a shape (h, w); a patient one is an octave finer and takes its time."""
     settings, size = config.extrema_tracking, float(np.sqrt(shape[0] * shape[1]) / PATCH_REFERENCE_PX)
     dis: cv2.DISOpticalFlow = cv2.DISOpticalFlow_create(cv2.DISOPTICAL_FLOW_PRESET_ULTRAFAST)  # type: ignore[attr-defined]
-    dis.setFinestScale(max(0, settings.flow_octave - round(float(np.log2(settings.flow_reduction)))))
+    octave = settings.flow_octave - round(float(np.log2(settings.flow_reduction)))
+    dis.setFinestScale(max(0, octave - 1 if patient else octave))
     dis.setGradientDescentIterations(2 * DESCENT_ITERATIONS if patient else DESCENT_ITERATIONS)
     dis.setVariationalRefinementIterations(settings.flow_refinements)
     patch = min(LARGEST_PATCH_PX, max(LEAST_PATCH_PX, round(size * settings.flow_patch)))
