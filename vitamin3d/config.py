@@ -38,6 +38,7 @@ AT_LEAST_ONE = (
     "initialization.history",
     "motion_check.interval",
     "motion_check.max_frames",
+    "motion_check.max_pairs",
     "recovery.interval",
     "bundle_adjustment.keyframe_interval",
     "window.keyframes",
@@ -156,7 +157,7 @@ class ContinuityConfig:
     """Grey levels on the grid; a picture with less shows nothing (a covered lens)."""
     good_correlation: float = 0.97
     """Below it the flow is tried once more, beginning with a homography of matched corners: large steps, dropped pictures."""
-    large_step: float = 0.02
+    large_step: float = 0.03
     """Median flow, in sizes of the picture (square root of its area), above which that is tried as well;"""
     largest_step: float = 0.15
     """and above which a flow that no corners confirm is none."""
@@ -164,7 +165,7 @@ class ContinuityConfig:
     """Below it the picture goes on from another one, or from none: a cut, a stray picture."""
     max_gap: int = 90
     """Frames after which the last picture before such a break is given up."""
-    corners: int = 1000
+    corners: int = 600
     min_matches: int = 25
     """That agree on the homography."""
 
@@ -291,7 +292,9 @@ class MotionCheckConfig:
     min_pairs: int = 50
     """with so many landmarks seen in both,"""
     min_share: float = 0.25
-    """and this share of those seen in the newest."""
+    """and this share of those seen in the newest;"""
+    max_pairs: int = 150
+    """at most so many of them are looked at."""
     sigma_px: float = 1.0
     """Of the Geman–McClure cost of the epipolar distances."""
     sound_ratio: float = 1.2

@@ -57,7 +57,9 @@ def _opinion(keyframe: int, T_1_0: Array, pixels_0: Array, pixels_1: Array, came
     R, t = T_1_0[:3, :3], T_1_0[:3, 3]
     if not np.linalg.norm(t) > 0.0:
         return None
-    rays_0, rays_1, sigma = camera.rays_from_ideal(pixels_0), camera.rays_from_ideal(pixels_1), config.sigma_px / camera.fx
+    some = slice(None, None, -(-len(pixels_0) // config.max_pairs))
+    rays_0, rays_1 = camera.rays_from_ideal(pixels_0[some]), camera.rays_from_ideal(pixels_1[some])
+    sigma = config.sigma_px / camera.fx
     best = best_motion(R, t, rays_0, rays_1, sigma)
     ratio = motion_cost(R, t, rays_0, rays_1, sigma) / max(best.cost, 1e-12)
     turn = np.degrees(np.arccos(np.clip(0.5 * (np.trace(best.R @ R.T) - 1.0), -1.0, 1.0)))
