@@ -157,7 +157,7 @@ class ContinuityConfig:
     """Grey levels on the grid; a picture with less shows nothing (a covered lens)."""
     good_correlation: float = 0.97
     """Below it the flow is tried once more, beginning with a homography of matched corners: large steps, dropped pictures."""
-    large_step: float = 0.03
+    large_step: float = 0.02
     """Median flow, in sizes of the picture (square root of its area), above which that is tried as well;"""
     largest_step: float = 0.15
     """and above which a flow that no corners confirm is none."""
@@ -165,7 +165,7 @@ class ContinuityConfig:
     """Below it the picture goes on from another one, or from none: a cut, a stray picture."""
     max_gap: int = 90
     """Frames after which the last picture before such a break is given up."""
-    corners: int = 600
+    corners: int = 1000
     min_matches: int = 25
     """That agree on the homography."""
 
