@@ -116,7 +116,7 @@ class Slam:
             self._place_repeats(front.frame.timestamp_ns, T_cam_world)
             if T_cam_world is not None:
                 with self.times.timed("map"):
-                    self._recent.append(TrackedView(front.frame, *self._seen(), self._image_motion))
+                    self._recent.append(self._view_of(front.frame))
                     self._map(front, T_cam_world)
                     self._directions.note(*self._seen_ids(), self.poses.newest(self.map)[:3, :3], self.camera)
         self._frame_count += 1
@@ -201,6 +201,10 @@ class Slam:
         valid = np.isfinite(pixels[:, 0])
         return seen.select(valid), pixels[valid]
 
+    def _view_of(self, frame: Frame) -> TrackedView:
+        """The newest frame with the tracks seen in it."""
+        return TrackedView(frame, *self._seen(), self._image_motion)
+
     def _seen_ids(self) -> tuple[Array, Array]:
         """Their ids and ideal pixels."""
         seen, pixels = self._seen()
@@ -214,7 +218,7 @@ class Slam:
 
     def _initialize(self, front: FrontEndFrame) -> None:
         """The first map from two frames; the frames before it are localised against it."""
-        view, aside = TrackedView(front.frame, *self._seen(), self._image_motion), self._aside
+        view, aside = self._view_of(front.frame), self._aside
         self._aside = view if front.follows is None and self._history.views else None
         if self._aside is not None:
             return  # of something else, for all that is known until the next frame
@@ -473,7 +477,7 @@ class Slam:
 
     def _add_keyframe(self, front: FrontEndFrame, T_cam_world: Array) -> int:
         deviation = self._position_deviation_deg(T_cam_world)
-        keyframe = add_view(self.map, TrackedView(front.frame, *self._seen(), self._image_motion), T_cam_world, deviation)
+        keyframe = add_view(self.map, self._view_of(front.frame), T_cam_world, deviation)
         self._pending_frames[keyframe] = front.frame
         self._pending_frames.pop(keyframe - self._untaken, None)
         self._remembered.add(keyframe, front.frame)

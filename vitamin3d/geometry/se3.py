@@ -72,6 +72,11 @@ def inverse(T_a_b: Array) -> Array:
     return T_b_a
 
 
+def rotation_angle_deg(R: Array) -> float:
+    """Of a rotation (3, 3), in [0, 180]."""
+    return float(np.degrees(np.arccos(np.clip(0.5 * (np.trace(R) - 1.0), -1.0, 1.0))))
+
+
 def between(T_cam_world_0: Array, T_cam_world_1: Array, share: float) -> Array:
     """T_cam_world (4, 4) at a share of the way from one camera to another: the centre goes straight, the rotation evenly."""
     centre_0, centre_1 = (inverse(T)[:3, 3] for T in (T_cam_world_0, T_cam_world_1))

@@ -13,7 +13,7 @@ import numpy as np
 from vitamin3d.config import MotionCheckConfig
 from vitamin3d.geometry.camera import Camera
 from vitamin3d.geometry.epipolar_refinement import best_motion, motion_cost
-from vitamin3d.geometry.se3 import inverse
+from vitamin3d.geometry.se3 import inverse, rotation_angle_deg
 from vitamin3d.mapping.sparse_map import SparseMap
 from vitamin3d.types import Array
 
@@ -35,22 +35,22 @@ class Opinion:
 def second_opinion(sparse_map: SparseMap, camera: Camera, config: MotionCheckConfig) -> Opinion | None:
     """The newest keyframe against the oldest with which it shares enough landmarks; None where there is no such one."""
     newest = sparse_map.num_keyframes - 1
+    ids_1, pixels_1 = _landmarks_of(sparse_map, newest)
     for keyframe in range(max(0, newest - config.max_keyframes), newest - 1):
-        pixels_0, pixels_1, share = _shared_landmarks(sparse_map, keyframe, newest)
-        if len(pixels_0) >= config.min_pairs and share >= config.min_share:
+        ids_0, pixels_0 = _landmarks_of(sparse_map, keyframe)
+        _, in_0, in_1 = np.intersect1d(ids_0, ids_1, return_indices=True)
+        if len(in_1) >= max(config.min_pairs, config.min_share * len(ids_1)):
             T_1_0 = sparse_map.T_cam_world[newest] @ inverse(sparse_map.T_cam_world[keyframe])
-            return _opinion(keyframe, T_1_0, pixels_0, pixels_1, camera, config)
+            return _opinion(keyframe, T_1_0, pixels_0[in_0], pixels_1[in_1], camera, config)
     return None
 
 
-def _shared_landmarks(sparse_map: SparseMap, keyframe_0: int, keyframe_1: int) -> tuple[Array, Array, float]:
-    """Ideal pixels (N, 2) in both keyframes of the landmarks that both observe, and their share of those of the second."""
-    rows = [sparse_map.observations_of(k) for k in (keyframe_0, keyframe_1)]
-    ids = [sparse_map.obs_landmark[r] for r in rows]
-    good = [np.flatnonzero(sparse_map.obs_valid[r] & sparse_map.is_mapped(i)) for r, i in zip(rows, ids, strict=True)]
-    _, in_0, in_1 = np.intersect1d(ids[0][good[0]], ids[1][good[1]], return_indices=True)
-    pixels = [sparse_map.obs_pixels[r][g[i]] for r, g, i in zip(rows, good, (in_0, in_1), strict=True)]
-    return pixels[0], pixels[1], len(in_1) / max(1, len(good[1]))
+def _landmarks_of(sparse_map: SparseMap, keyframe: int) -> tuple[Array, Array]:
+    """Ids (N,) and ideal pixels (N, 2) of the landmarks that a keyframe observes."""
+    rows = sparse_map.observations_of(keyframe)
+    ids = sparse_map.obs_landmark[rows]
+    good = sparse_map.obs_valid[rows] & sparse_map.is_mapped(ids)
+    return ids[good], sparse_map.obs_pixels[rows][good]
 
 
 def _opinion(keyframe: int, T_1_0: Array, pixels_0: Array, pixels_1: Array, camera: Camera, config: MotionCheckConfig) -> Opinion | None:
@@ -62,9 +62,8 @@ def _opinion(keyframe: int, T_1_0: Array, pixels_0: Array, pixels_1: Array, came
     sigma = config.sigma_px / camera.fx
     best = best_motion(R, t, rays_0, rays_1, sigma)
     ratio = motion_cost(R, t, rays_0, rays_1, sigma) / max(best.cost, 1e-12)
-    turn = np.degrees(np.arccos(np.clip(0.5 * (np.trace(best.R @ R.T) - 1.0), -1.0, 1.0)))
     direction = np.degrees(np.arccos(np.clip(abs(best.t @ t) / np.linalg.norm(t), 0.0, 1.0)))
-    return Opinion(keyframe, float(ratio), float(turn), float(direction))
+    return Opinion(keyframe, float(ratio), rotation_angle_deg(best.R @ R.T), float(direction))
 
 
 class MotionCheck:

@@ -12,6 +12,7 @@ import numpy as np
 from vitamin3d.config import RotationConfig
 from vitamin3d.geometry.camera import Camera
 from vitamin3d.geometry.rotation_fit import fit_rotation, turned_by
+from vitamin3d.geometry.se3 import rotation_angle_deg
 from vitamin3d.mapping.sparse_map import GrowingArray
 from vitamin3d.types import Array, Frame
 
@@ -72,8 +73,7 @@ class Turns:
 
     def has_turned(self, config: RotationConfig) -> bool:
         """Whether the camera has turned by more than a hand's shake, in more than a few frames."""
-        angle = np.degrees(np.arccos(np.clip(0.5 * (np.trace(self.newest) - 1.0), -1.0, 1.0)))
-        return bool(not self._is_ended and angle > config.min_turn_deg)
+        return not self._is_ended and rotation_angle_deg(self.newest) > config.min_turn_deg
 
     def since(self, reference: int) -> list[tuple[Frame, Array]]:
         """The frames of the chain with T_cam_reference (4, 4), all at one place; none where the reference frame is not in it."""

@@ -15,6 +15,8 @@ from vitamin3d.config import ContinuityConfig
 from vitamin3d.tracking.corners import described_corners, mutual_matches
 from vitamin3d.types import Array
 
+LEAST_SHARED = 0.1
+"""Of a picture, that must be in the other one too to be compared."""
 LARGEST_DIFFERENCE = 20
 """Grey levels: what is hidden in one of the pictures says no more than that."""
 HOMOGRAPHY_PX, HOMOGRAPHY_ITERATIONS = 6.0, 500
@@ -58,15 +60,21 @@ def view_of(index: int, picture: Array, config: ContinuityConfig) -> View:
     return View(index, picture, cv2.resize(picture, size, interpolation=cv2.INTER_AREA).astype(np.float32), config.corners)
 
 
+def _moved_back(b: Array, flow: Array) -> tuple[Array, Array]:
+    """A picture (h, w) moved back by a flow (h, w, 2) that leads to it, and where (h, w) bool that stays inside."""
+    height, width = b.shape
+    u, v = np.meshgrid(np.arange(width, dtype=np.float32), np.arange(height, dtype=np.float32))
+    u, v = u + flow[..., 0], v + flow[..., 1]
+    inside = (u >= 0) & (v >= 0) & (u <= width - 1) & (v <= height - 1)
+    return cv2.remap(b, u, v, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE), inside
+
+
 def correlation(a: Array, b: Array, flow: Array) -> float:
     """Zero-mean normalised cross-correlation of grid a (h, w) with grid b moved back by a flow (H, W, 2), where both are there; else 0."""
     height, width = a.shape
     coarse = cv2.resize(flow, (width, height), interpolation=cv2.INTER_AREA) * np.float32(width / flow.shape[1])
-    u, v = np.meshgrid(np.arange(width, dtype=np.float32), np.arange(height, dtype=np.float32))
-    u, v = u + coarse[..., 0], v + coarse[..., 1]
-    moved = cv2.remap(b, u, v, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
-    inside = (u >= 0) & (v >= 0) & (u <= width - 1) & (v <= height - 1)
-    if inside.sum() < 0.1 * a.size:
+    moved, inside = _moved_back(b, coarse)
+    if inside.sum() < LEAST_SHARED * a.size:
         return 0.0
     x, y = a[inside] - a[inside].mean(), moved[inside] - moved[inside].mean()
     return float((x * y).sum() / np.sqrt(max(1e-6, float((x * x).sum()) * float((y * y).sum()))))
@@ -97,14 +105,10 @@ def step_of(flow: Array) -> float:
 
 def residual(a: Array, b: Array, flow: Array) -> float:
     """Mean difference, grey levels, of a picture (h, w) uint8 from another, moved back by a flow (h, w, 2), where both are there."""
-    height, width = a.shape
-    u, v = np.meshgrid(np.arange(width, dtype=np.float32), np.arange(height, dtype=np.float32))
-    u, v = u + flow[..., 0], v + flow[..., 1]
-    inside = (u >= 0) & (v >= 0) & (u <= width - 1) & (v <= height - 1)
-    if inside.sum() < 0.1 * a.size:
+    moved, inside = _moved_back(b, flow)
+    if inside.sum() < LEAST_SHARED * a.size:
         return float("inf")
-    difference = cv2.absdiff(a, cv2.remap(b, u, v, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE))[inside]
-    return float(np.minimum(difference, LARGEST_DIFFERENCE).mean())
+    return float(np.minimum(cv2.absdiff(a, moved)[inside], LARGEST_DIFFERENCE).mean())
 
 
 class FlowTracker:
@@ -151,11 +155,10 @@ class FlowTracker:
             return None
         flow = self._flow(a, b)
         plain = Continuation(flow, correlation(a.grid, b.grid, flow))
-        is_easy = plain.correlation >= self.config.good_correlation and step_of(flow) <= self.config.large_step
-        start = None if is_easy else homography_flow(a, b, self.config)
+        is_explained, step = plain.correlation >= self.config.good_correlation, step_of(flow)
+        start = None if is_explained and step <= self.config.large_step else homography_flow(a, b, self.config)
         if start is None:
-            return plain if step_of(flow) <= self.config.largest_step else None
-        is_explained = plain.correlation >= self.config.good_correlation
+            return plain if step <= self.config.largest_step else None
         flow = np.asarray((self._dis if is_explained else self._dis_from).calc(a.picture, b.picture, start))
         again = Continuation(flow, correlation(a.grid, b.grid, flow))
         if not is_explained:  # the exposure may differ
