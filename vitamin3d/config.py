@@ -782,6 +782,7 @@ def live_config(base: Config) -> Config:
     return change(
         base,
         extrema=change(base.extrema, max_tracks=min(5600, base.extrema.max_tracks)),
+        continuity=change(base.continuity, large_step=max(0.05, base.continuity.large_step)),
         keyframes=change(base.keyframes, motion_px=20.0),
         window=change(base.window, settled_keyframes=2, settled_frames=10),
         bundle_adjustment=change(

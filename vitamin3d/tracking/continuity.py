@@ -90,12 +90,16 @@ def homography_flow(a: View, b: View, config: ContinuityConfig) -> Array | None:
     H, agrees = cv2.findHomography(x, y, cv2.RANSAC, HOMOGRAPHY_PX, maxIters=HOMOGRAPHY_ITERATIONS)
     if H is None or agrees.sum() < config.min_matches:
         return None
-    height, width = a.picture.shape
-    u, v = np.meshgrid(np.arange(width, dtype=np.float64), np.arange(height, dtype=np.float64))
-    moved = np.stack([u, v, np.ones_like(u)], axis=-1) @ H.T
+    flow = _flow_of_homography(H, *a.picture.shape)
+    return flow if np.isfinite(flow).all() and np.abs(flow).max() < 2 * a.picture.shape[1] else None
+
+
+def _flow_of_homography(H: Array, height: int, width: int) -> Array:
+    """(h, w, 2) float32: where a homography (3, 3) moves each pixel."""
+    u, v = np.arange(width, dtype=np.float64), np.arange(height, dtype=np.float64)[:, None]
+    x, y, z = (row[0] * u + (row[1] * v + row[2]) for row in H)
     with np.errstate(divide="ignore", invalid="ignore"):
-        flow = moved[..., :2] / moved[..., 2:] - np.stack([u, v], axis=-1)
-    return flow.astype(np.float32) if np.isfinite(flow).all() and np.abs(flow).max() < 2 * width else None
+        return np.stack([x / z - u, y / z - v], axis=-1).astype(np.float32)
 
 
 def step_of(flow: Array) -> float:
