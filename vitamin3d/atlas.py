@@ -30,11 +30,13 @@ class Atlas:
         """The next one, while the camera is lost in the active one."""
         self.active = self._new_map()
         """The map in which the camera is tracked, or was last."""
+        self._frames_held = 0
+        """In a row, in which the camera was found in it."""
 
     @property
     def current(self) -> Slam:
         """The map for which the newest frame was tracked."""
-        return self.active if self.successor is None else self.successor
+        return self.active if self.successor is None or self._frames_held else self.successor
 
     def process_frame(self, front: FrontEndFrame) -> SlamState:
         """One frame: tracked in the active map, or in the one that begins where that is lost."""
@@ -47,33 +49,65 @@ class Atlas:
             self.active.take_adjustment(wait=True)
             self.active = self._new_map()
         state = self.active.process_frame(front)
-        is_held = state not in (SlamState.LOST, SlamState.ROTATING)
-        if is_held or self.active.map.num_keyframes == 0:
-            self.successor = None
+        is_held = state not in (SlamState.LOST, SlamState.ROTATING) or self.active.map.num_keyframes == 0
+        self._frames_held = self._frames_held + 1 if is_held else 0
+        if is_held:
+            self._keep_successor_ready(front)
             return state
         self.active.take_adjustment(wait=True)  # both maps may have one adjuster, and it does one thing at a time
-        return self._take_over() if self.active.heritage else self._succeed(front)
+        return self._take_over(front) if self.active.is_bent else self._succeed(front, state)
 
-    def _take_over(self) -> SlamState:
-        """A bent map ends for good: near the bend nothing in it is certain. Its newest frames and tracks are the next map's."""
-        bent, self.active = self.active, self._new_map()
-        self.left += [] if self._is_young(bent) else [bent]
-        self.active.succeed_to(bent)
-        return self.active.state
-
-    def _succeed(self, front: FrontEndFrame) -> SlamState:
-        """The frame in the successor, which becomes the active map when it has held for a while."""
-        self.successor = self.successor or self._new_map()
+    def _keep_successor_ready(self, front: FrontEndFrame) -> None:
+        """A camera that was found again may be lost again soon: the next map goes on beside for a while."""
+        if self.successor is None or self._frames_held > self.config.atlas.frames_beside:
+            self.successor = None
+            return
+        self.active.take_adjustment(wait=True)
         state = self.successor.process_frame(front)
         self.successor.take_adjustment(wait=True)
         if state is SlamState.LOST or self._is_false(self.successor):
-            self.successor = self._new_map()
-            return self.successor.process_frame(front)
-        if state is SlamState.TRACKING and not self._is_young(self.successor):
-            self.active.leave_turns_to(self.successor)
-            self.left += [] if self._is_young(self.active) else [self.active]
-            self.active, self.successor = self.successor, None
+            self.successor = None
+
+    def _take_over(self, front: FrontEndFrame) -> SlamState:
+        """A bent map ends for good: near the bend nothing in it is certain. Its newest frames and tracks are the next map's."""
+        bent, ready, self.successor = self.active, self.successor, None
+        self.left += [] if self._is_young(bent) else [bent]
+        if ready is not None and ready.map.num_keyframes and ready.process_frame(front) is SlamState.TRACKING:
+            self.active = ready
+            return SlamState.TRACKING
+        self.active = self._new_map()
+        self.active.succeed_to(bent)
+        bent.heritage.clear()
+        return self.active.state
+
+    def _succeed(self, front: FrontEndFrame, state: SlamState) -> SlamState:
+        """The frame in the successor, which becomes the active map when it has held for a while."""
+        if self.successor is None:
+            self.successor, state = self._begun(self.active, front)
+        else:
+            state = self.successor.process_frame(front)
+        self.successor.take_adjustment(wait=True)
+        if state is SlamState.LOST or self._is_false(self.successor):
+            self.successor, state = self._begun(self.successor if state is SlamState.LOST else None, front)
+        if state is SlamState.TRACKING and self._has_held(self.successor):
+            self._hand_over_to(self.successor)
         return state
+
+    def _hand_over_to(self, slam: Slam) -> None:
+        is_left = self.active.leave_to(slam) and not self._is_young(self.active)
+        self.left += [self.active] if is_left else []
+        self.active, self.successor = slam, None
+
+    def _begun(self, other: Slam | None, front: FrontEndFrame) -> tuple[Slam, SlamState]:
+        """A new map and its state after the frame: with the tracks of one in which the camera was lost, if they reach the frame."""
+        slam = self._new_map()
+        if other is None or len(other.heritage) < 2:
+            return slam, slam.process_frame(front)
+        return slam, slam.succeed_to(other)
+
+    def _has_held(self, slam: Slam) -> bool:
+        """Whether a map that is not young has enough frames that the active one does not have."""
+        return not self._is_young(slam) and slam.num_frames_beyond(self.active) >= self.config.atlas.min_frames
 
     def _new_map(self) -> Slam:
         slam = Slam(self.camera, self.config, self._born, self.times)
@@ -119,7 +153,9 @@ class Atlas:
         return sum(slam.adjustments_awaited for slam in self._all())
 
     def finish(self) -> None:
-        """The adjustment of each whole map at the end of a recording."""
+        """The adjustment of each whole map at the end of a recording; the next map goes on if there is one."""
+        if self.successor is not None and not self._frames_held and not self._is_young(self.successor):
+            self._hand_over_to(self.successor)
         for slam in self.ranked():
             slam.finish()
 
@@ -129,12 +165,12 @@ class Atlas:
         return sorted(found, key=lambda slam: (-len(slam.poses), slam.number))
 
     def _all(self) -> list[Slam]:
-        return [*self.left, self.active, *([] if self.successor is None else [self.successor])]
+        return [*self.left, self.active, *([] if self.successor is None or self._frames_held else [self.successor])]
 
     def take_settled_keyframes(self, everything: bool = False) -> list[tuple[Slam, int, Frame]]:
         """Map, keyframe and picture of those that settled since the last call (or all that remain), each once."""
         found: list[tuple[Slam, int, Frame]] = []
         for slam in self._all():
-            if everything or not self._is_young(slam):
+            if everything or not (slam is self.successor or self._is_young(slam)):
                 found += [(slam, k, frame) for k, frame in slam.take_settled_keyframes(everything or slam in self.left)]
         return found

@@ -36,8 +36,8 @@ AT_LEAST_ONE = (
     "extrema_tracking.flow_patch",
     "extrema_tracking.flow_stride",
     "initialization.history",
+    "atlas.max_heritage",
     "motion_check.interval",
-    "motion_check.max_frames",
     "motion_check.max_pairs",
     "recovery.interval",
     "bundle_adjustment.keyframe_interval",
@@ -307,8 +307,10 @@ class MotionCheckConfig:
     """or so much in the direction of the way,"""
     max_doubts: int = 1
     """in more than so many checks since the last sound one."""
-    max_frames: int = 60
-    """The newest frames that a map that follows a bent one may begin with."""
+    min_pairs_of_a_link: int = 25
+    """That two keyframes share to link the newer one to those before: what nothing links has a scale of its own;"""
+    linked_ratio: float = 1.35
+    """the map's motion between them may be so much dearer."""
 
 
 @dataclass(frozen=True)
@@ -364,6 +366,10 @@ class AtlasConfig:
     """And one in which fewer of the tracks that show parallax become landmarks: it may be that of something that moves, or of a turn;"""
     judged_tracks: int = 500
     """after so many such tracks."""
+    frames_beside: int = 30
+    """The next map goes on beside one in which the camera was found again, so long;"""
+    max_heritage: int = 60
+    """The newest frames of a map in which the camera is lost, with which the next one may begin."""
 
 
 @dataclass(frozen=True)

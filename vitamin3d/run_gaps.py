@@ -72,7 +72,7 @@ TEXTS = {
     Cause.STANDING: (f"the camera stands still{NO_DEPTH}", "move sideways, or leave this part out"),
     Cause.TOO_SHORT: ("tracked in a map that was lost when young and dropped", "film this part slower and longer, with more overlap"),
     Cause.BENT: (
-        "tracked, but the map had bent since and was cut back: the pictures' own motion was another one",
+        "tracked, but the map had bent or hung on too little since, and was cut back to where it was sound",
         "keep things near and far in view in turns and doorways, and film them slower",
     ),
     Cause.MOVING: ("too much moves by itself: the scene is not rigid", "keep what moves small in the picture, or film without it"),

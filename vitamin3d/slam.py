@@ -46,6 +46,8 @@ IDS_PER_MAP = 1 << 40
 """Tracks of different maps have different ids."""
 UNTAKEN_WINDOWS, UNTAKEN_KEYFRAMES = 2, 16
 """Pictures of keyframes that nobody takes are kept for so many windows, or keyframes where that is more."""
+MOST_BEQUEATHED_BYTES = 1 << 28
+"""Of the pictures that the next map may begin with."""
 
 
 class Slam:
@@ -68,12 +70,11 @@ class Slam:
         self._pending_frames: dict[int, Frame] = {}
         self._directions, self._turns, self._num_doubts = Directions(), Turns(), 0
         self._motion_check = MotionCheck(config.motion_check)
-        self._recent: deque[TrackedView] = deque(maxlen=config.motion_check.max_frames)
-        self.heritage: list[TrackedView] = []
-        """Of a map that was bent: the frames since its last sound keyframe, for the map that follows."""
+        self.heritage: deque[TrackedView] = deque(maxlen=config.atlas.max_heritage)
+        """The newest frames, where each continues the one before: the map that follows begins with them."""
+        self.is_bent = False
         self._remembered = RememberedKeyframes(config.relocalization)
         self._untaken = max(UNTAKEN_KEYFRAMES, UNTAKEN_WINDOWS * config.window.keyframes)
-        self._begins_the_run = True
         self._aside: TrackedView | None = None
         self._turned_frames: list[int] = []
         self._repeats: list[Frame] = []
@@ -94,7 +95,7 @@ class Slam:
 
     def inherit(self, other: "Slam") -> None:
         """Begins with the camera as another map of the recording has refined it."""
-        self.camera, self._begins_the_run = other.camera, False
+        self.camera = other.camera
         self.calibration.inherit(other.calibration)
 
     def process_frame(self, front: FrontEndFrame) -> SlamState:
@@ -111,12 +112,13 @@ class Slam:
                 self._initialize(front)
         else:
             with self.times.timed("localize"):
+                view = self._view_of(front.frame)
                 T_cam_world = self._localize(front)
             self._refill_when_due(front)
             self._place_repeats(front.frame.timestamp_ns, T_cam_world)
+            self._bequeath(front, view if T_cam_world is None else self._view_of(front.frame))
             if T_cam_world is not None:
                 with self.times.timed("map"):
-                    self._recent.append(self._view_of(front.frame))
                     self._map(front, T_cam_world)
                     self._directions.note(*self._seen_ids(), self.poses.newest(self.map)[:3, :3], self.camera)
         self._frame_count += 1
@@ -228,15 +230,24 @@ class Slam:
         self._history.append(view)
         self._begin_map()
 
-    def succeed_to(self, bent: "Slam") -> None:
-        """Goes on with the tracks of a map that was bent, from its keyframes since it was sound; at once, if these make a map."""
-        self._newest_frame, self._last_ns = bent._newest_frame, bent._last_ns
-        self._next_id = 1 + max(int(view.tracks.ids.max(initial=0)) for view in bent.heritage)
-        for view in bent.heritage:
+    def _bequeath(self, front: FrontEndFrame, view: TrackedView) -> None:
+        """What the map that follows this one will begin with, should the camera be lost in the next frame."""
+        if front.follows is None:
+            self.heritage.clear()
+        self.heritage.append(view)
+        while len(self.heritage) * view.frame.num_bytes > MOST_BEQUEATHED_BYTES:
+            self.heritage.popleft()
+
+    def succeed_to(self, other: "Slam") -> SlamState:
+        """Goes on with the newest frames and the tracks of a map in which the camera was lost; at once, if these make a map."""
+        views = other.heritage
+        self._newest_frame, self._last_ns = other._newest_frame, other._last_ns
+        self._next_id = 1 + max(int(view.tracks.ids.max(initial=0)) for view in views)
+        for view in views:
             self._history.append(view)
-        self.tracks, self._image_motion = bent.heritage[-1].tracks, bent.heritage[-1].image_motion
-        bent.heritage = []
+        self.tracks, self._image_motion = views[-1].tracks, views[-1].image_motion
         self._begin_map()
+        return self.state
 
     def _begin_map(self) -> None:
         """From the newest frame and the oldest that shares tracks with it, where they show parallax."""
@@ -272,7 +283,7 @@ class Slam:
 
     def _log_history(self) -> None:
         """Localises the frames from before the map against it, going back from it: their tracks were kept."""
-        for frame, T_cam_reference in self._turns.since(self.map.frame_indices[0]) if self._begins_the_run else []:
+        for frame, T_cam_reference in self._turns.since(self.map.frame_indices[0]):
             self.poses.add(frame, 0, T_cam_reference)
         T_next, logged = self.map.T_cam_world[-1], []
         for view in reversed(self._history.views):
@@ -366,9 +377,26 @@ class Slam:
                 self.poses.shift(index, k / (len(self._turned_frames) + 1) * way, self.map)
         self._turned_frames.clear()
 
-    def leave_turns_to(self, other: "Slam") -> None:
-        """Frames of a turn that no landmark ended are those of the map that followed, where it has them."""
+    def num_frames_beyond(self, other: "Slam") -> int:
+        """How many frames are localised in this map and not in the other."""
+        return self.poses.num_beyond(other.poses)
+
+    def leave_to(self, other: "Slam") -> bool:
+        """What the map that followed knows too is its own: before the camera was lost here it hung on little, there nothing had been lost.
+
+        Frames of a turn that no landmark ended are, where the other has them; and all since its first one, and since the last sound
+        keyframe here. Whether anything is left.
+        """
+        self.heritage.clear()
         self.poses.forget([index for index in self._turned_frames if index in other.poses])
+        first = other.poses.first_frame
+        last_sound = self._motion_check.last_sound(self.map, self.camera)
+        keyframe = min(int(np.searchsorted(self.map.frame_indices, first)) - 1, last_sound)
+        if keyframe < 0:
+            return False
+        self.poses.forget_since(first)
+        self._cut_back(keyframe)
+        return True
 
     def _turned(self, seen: Tracks, pixels: Array, R_before: Array) -> Array | None:
         """R_cam_world of a camera that turned on the spot; None where it did not, or seems to travel for a few frames."""
@@ -446,8 +474,8 @@ class Slam:
                 self._adjust_window()
             self._refine_calibration_when_due()
             self.poses.add(front.frame, keyframe, np.eye(4))
-            if keyframe % self.config.motion_check.interval == 0 and self._motion_check.is_bent(self.map, self.camera):
-                self._retreat(self._motion_check.last_sound)
+            if self._motion_check.is_due(keyframe) and self._motion_check.is_bent(self.map, self.camera):
+                self._retreat(self._motion_check.last_sound(self.map, self.camera))
         else:
             T_cam_world = self._adjust_with_frame(T_cam_world)
             self.poses.add_world(front.frame, T_cam_world, self.map)
@@ -455,15 +483,17 @@ class Slam:
     def _retreat(self, keyframe: int) -> None:
         """Forgets all since a keyframe, which the map that follows inherits; the camera is lost in this one."""
         self.take_adjustment(wait=True)
-        self.heritage = [view for view in self._recent if view.frame.index >= self.map.frame_indices[keyframe]]
-        self._recent.clear()
+        self.is_bent, self.state = True, SlamState.LOST
+        self._cut_back(keyframe)
+
+    def _cut_back(self, keyframe: int) -> None:
+        """Forgets what came after a keyframe; the tracks end."""
         if keyframe + 1 < self.map.num_keyframes:
             self.poses.forget_since(self.map.frame_indices[keyframe + 1])
         self.tracks, self._meetings = Tracks.empty(), []
         kept_keyframes = np.arange(keyframe + 1)
-        sound, kept_ids = self.map.condensed(kept_keyframes, np.zeros(0, np.int64))
-        self._become(Condensation(sound, kept_keyframes, kept_ids))
-        self.state = SlamState.LOST
+        kept, kept_ids = self.map.condensed(kept_keyframes, np.zeros(0, np.int64))
+        self._become(Condensation(kept, kept_keyframes, kept_ids))
 
     def _is_keyframe(self, frame: Frame) -> bool:
         seen, pixels = self._seen()
@@ -544,7 +574,7 @@ class Slam:
             self.take_adjustment(wait=True)
             needed = np.concatenate([self.tracks.ids, *(pair.ravel() for pair in self._meetings)])
             self._become(condense(self.map, np.unique(needed), self._untaken, self.config.memory))
-            self._recent.clear()  # their tracks have other ids
+            self.heritage.clear()  # their tracks have other ids
 
     def _become(self, done: Condensation) -> None:
         """Takes a smaller map; ids and keyframes are numbered anew."""

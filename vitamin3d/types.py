@@ -37,6 +37,11 @@ class Frame:
     color: Array | None = None
     """(H, W, 3) uint8 RGB, or None where the source is grey."""
 
+    @property
+    def num_bytes(self) -> int:
+        """Of memory."""
+        return self.image.nbytes + (0 if self.color is None else self.color.nbytes)
+
 
 @dataclass(frozen=True)
 class DominantFlow:

@@ -13,7 +13,7 @@ from vitamin3d.geometry.camera import Camera
 from vitamin3d.geometry.sim3_alignment import align_sim3
 from vitamin3d.mapping.landmark_triangulation import Rigidity
 from vitamin3d.mapping.window_adjustment import AdjustAtOnce
-from vitamin3d.slam import IDS_PER_MAP
+from vitamin3d.slam import IDS_PER_MAP, Slam
 from vitamin3d.tracking.front_end import FrontEnd
 from vitamin3d.types import Frame, SlamState
 
@@ -317,14 +317,56 @@ def test_all_maps_have_one_adjuster(demo, plain, flipped):
     assert atlas.successor.times is atlas.active.times is atlas.times
 
 
-def test_the_image_moves_since_the_frame_before_and_not_since_the_epoch(demo, plain, flipped):
+def test_the_image_moves_since_the_frame_before_and_not_since_the_epoch(demo, plain):
     """Which matters for a rolling shutter: after the first frame, and after a cut."""
     rolling = dataclasses.replace(demo.camera, readout_s=0.02)
     front_end, atlas, speeds = FrontEnd(Config()), Atlas(rolling, Config()), []
-    for index, picture in enumerate(plain[:40] + flipped[40:44]):
+    for index, picture in enumerate(plain[:40] + [picture[::-1].copy() for picture in plain[40:44]]):
         atlas.process_frame(front_end.process(Frame(index, 10**18 + index * PERIOD_NS, picture)))
         speeds.append(np.linalg.norm(atlas.current._image_motion[0]))
     pixels_per_second = np.array([note.motion_px for note in atlas.notes]) / (1e-9 * PERIOD_NS)
     assert (pixels_per_second[1:3] > 10).all() and speeds[0] == speeds[40] == 0.0
     for k in (1, 2, 20, 41, 42, 43):
         assert 0.3 * pixels_per_second[k] < speeds[k] < 3 * pixels_per_second[k], k
+
+
+@pytest.fixture
+def lost_at_120(monkeypatch):
+    """The first map loses the camera in frame 120 of a film that goes on, and finds it again from a frame in `again` on."""
+    again = []
+    localize = Slam._localize
+
+    def lose(slam, front):
+        is_lost = slam.number == 0 and front.frame.index >= 120 and not (again and front.frame.index >= again[0])
+        if is_lost:
+            slam.state = SlamState.LOST
+        return None if is_lost else localize(slam, front)
+
+    monkeypatch.setattr(Slam, "_localize", lose)
+    return again
+
+
+def test_the_next_map_begins_with_the_tracks_of_the_one_in_which_the_camera_was_lost(demo, plain, lost_at_120):
+    atlas, ids = track(demo, plain)
+    assert [note.state for note in atlas.notes[119:]] == [SlamState.TRACKING] * 31  # in the frame in which it was lost too
+    older, newer = sorted(atlas.ranked(), key=lambda slam: slam.number)
+    assert (older.number, newer.number) == (0, 1) and atlas.active is newer and atlas.left == [older]
+    assert frames_of(older, 150) + frames_of(newer, 150) == list(range(150))  # what both knew is the newer one's
+    assert 10 < len(older.poses) < 120 and older.map.frame_indices[-1] < newer.map.frame_indices[0]
+    assert path_error(older, demo, range(150)) < 0.01 and path_error(newer, demo, range(150)) < 0.01
+    assert not np.isin(ids[130], ids[119]).any()
+
+
+def test_a_map_that_finds_its_camera_again_goes_on_and_the_next_is_dropped_after_a_while(demo, plain, lost_at_120):
+    lost_at_120.append(125)
+    config = dataclasses.replace(Config(), atlas=dataclasses.replace(Config().atlas, frames_beside=12))
+    front_end, atlas = FrontEnd(config), Atlas(demo.camera, config)
+    for index in range(145):
+        atlas.process_frame(front_end.process(Frame(index, index * PERIOD_NS, plain[index])))
+        if 120 <= index < 125:
+            assert atlas.current is atlas.successor and atlas.current.map.num_keyframes > 5
+        else:
+            assert atlas.current is atlas.active and atlas.active.number == 0
+        assert (atlas.successor is not None) == (120 <= index < 125 + 12)
+        assert all(slam is not atlas.successor for slam, _, _ in atlas.take_settled_keyframes())
+        assert len(atlas.ranked()) == (2 if 120 <= index < 125 else 1 if index > 60 else len(atlas.ranked()))

@@ -71,12 +71,46 @@ def test_a_camera_that_rests_has_no_direction(rng):
 
 def test_it_takes_doubts_in_a_row_and_names_the_keyframe_before_the_bend(rng):
     check, sound, bent = MotionCheck(CONFIG), arc_map(rng, 7), arc_map(rng, 10, bent_from=6)
-    assert not check.is_bent(sound, PINHOLE) and check.last_sound == 6
-    assert not check.is_bent(bent, PINHOLE) and check.is_bent(bent, PINHOLE) and check.last_sound == 6
+    assert not check.is_bent(sound, PINHOLE) and check.last_sound(sound, PINHOLE) == 6
+    assert not check.is_bent(bent, PINHOLE) and check.is_due(9) and check.is_bent(bent, PINHOLE)
     check = MotionCheck(CONFIG)
-    assert not check.is_bent(bent, PINHOLE) and check.last_sound == 3  # the older of the two that differ
-    assert not check.is_bent(arc_map(rng, 10), PINHOLE) and check.last_sound == 9  # and the doubt is over
+    assert not check.is_bent(bent, PINHOLE) and check.last_sound(bent, PINHOLE) == 5  # the last that agrees with those before
+    assert not check.is_bent(arc_map(rng, 10), PINHOLE) and not check.is_due(9)  # and the doubt is over
     assert not check.is_bent(bent, PINHOLE)
+
+
+def test_while_there_is_no_doubt_it_is_due_every_few_keyframes():
+    check = MotionCheck(CONFIG)
+    assert [k for k in range(1, 13) if check.is_due(k)] == [4, 8, 12]
+
+
+def two_halves(rng, num_shared):
+    """A map of 12 keyframes whose later half sees other landmarks than its first one, but for some."""
+    sparse_map = arc_map(rng, 12)
+    later = np.arange(sparse_map.keyframe_starts[6], len(sparse_map.obs_landmark))
+    ids = sparse_map.obs_landmark[: sparse_map.keyframe_starts[6]]
+    early = np.arange(len(ids))
+    sparse_map.remove_observations(early[(ids >= 150)])
+    sparse_map.remove_observations(later[sparse_map.obs_landmark[later] < 150 - num_shared])
+    return sparse_map
+
+
+def test_what_nothing_links_to_the_sound_keyframes_is_cut_off(rng):
+    apart, linked = two_halves(rng, 20), two_halves(rng, 40)  # fewer and more than a link needs, and too few for an opinion
+    for sparse_map, is_cut_off in ((apart, True), (linked, False)):
+        check = MotionCheck(CONFIG)
+        assert check.is_bent(sparse_map, PINHOLE) == is_cut_off
+        assert (check.last_sound(sparse_map, PINHOLE) == 5) == is_cut_off
+    assert not MotionCheck(dataclasses.replace(CONFIG, min_pairs_of_a_link=10)).is_bent(apart, PINHOLE)
+
+
+def test_a_map_that_is_bent_soon_after_a_doubtful_link_ends_before_it(rng):
+    sparse_map = arc_map(rng, 12, bent_from=6)  # seen from keyframe 11 six keyframes back all agree
+    strict = dataclasses.replace(CONFIG, max_keyframes=4, linked_ratio=1e9)
+    check = MotionCheck(strict)
+    assert not check.is_bent(sparse_map, PINHOLE) and check.last_sound(sparse_map, PINHOLE) == 5
+    longer = MotionCheck(dataclasses.replace(strict, linked_ratio=1.0))
+    assert longer.is_bent(sparse_map, PINHOLE) and longer.last_sound(sparse_map, PINHOLE) == 5
 
 
 def test_a_difference_that_is_small_is_no_bend(rng):
@@ -90,7 +124,7 @@ def test_the_last_sound_keyframe_is_numbered_anew_with_the_map(rng):
     check = MotionCheck(CONFIG)
     check.is_bent(arc_map(rng, 7), PINHOLE)
     check.move_to(np.array([0, 2, 4, 5, 8]))
-    assert check.last_sound == 3  # keyframe 5, the last one kept of those up to 6
+    assert check.last_sound(arc_map(rng, 4), PINHOLE) == 3  # keyframe 5, the last one kept of those up to 6
 
 
 def test_the_best_motion_costs_less_than_the_true_one_and_is_near_it(rng):
@@ -113,23 +147,22 @@ def test_the_best_motion_costs_less_than_the_true_one_and_is_near_it(rng):
 @pytest.fixture(scope="module")
 def bent_film(demo):
     """The demo, whose map is called bent since its keyframe 6 at the first check with 13 keyframes or more."""
-    patch = pytest.MonkeyPatch()
     called = []
 
     def is_bent(self, sparse_map, camera):
-        self.last_sound = 6
         if not called and sparse_map.num_keyframes > 12:
             called.append((sparse_map.frame_indices[7], sparse_map.frame_indices[-1]))
             return True
         return False
 
-    patch.setattr(MotionCheck, "is_bent", is_bent)
     front_end, atlas, states, ids = FrontEnd(Config()), Atlas(demo.camera, Config()), [], []
-    for index in range(110):
-        states.append(atlas.process_frame(front_end.process(Frame(index, index * 50_000_000, demo.read(index).image))))
-        slam = atlas.current
-        ids.append((slam.number, slam.tracks.ids.copy(), slam.unique_ids(slam.tracks.ids)))
-    patch.undo()
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(MotionCheck, "is_bent", is_bent)
+        patch.setattr(MotionCheck, "last_sound", lambda self, sparse_map, camera: 6)
+        for index in range(110):
+            states.append(atlas.process_frame(front_end.process(Frame(index, index * 50_000_000, demo.read(index).image))))
+            slam = atlas.current
+            ids.append((slam.number, slam.tracks.ids.copy(), slam.unique_ids(slam.tracks.ids)))
     atlas.finish()
     return atlas, called[0], states, ids
 

@@ -39,6 +39,19 @@ class PoseLog:
     def __contains__(self, frame_index: object) -> bool:
         return frame_index in self._row_of_frame
 
+    def num_beyond(self, other: "PoseLog") -> int:
+        """How many frames the other log does not have."""
+        return len(self._row_of_frame.keys() - other._row_of_frame.keys())
+
+    @property
+    def first_frame(self) -> int:
+        """Index of the earliest frame."""
+        return min(self._row_of_frame)
+
+    def num_before(self, frame_index: int) -> int:
+        """How many frames come before one."""
+        return sum(index < frame_index for index in self._row_of_frame)
+
     def forget(self, frame_indices: Iterable[int]) -> None:
         """Takes frames out of the log."""
         for index in frame_indices:
