@@ -48,6 +48,7 @@ class Tracker:
 
     def __init__(self, config: Config) -> None:
         self.config, self.front_end = config, FrontEnd(config)
+        self.front_end.times.clock = time.thread_time
         self.tracks, self.times = Tracks.empty(), StepTimes()
         self._next_id = self._frame_count = 0
         self._newest: int | None = None
