@@ -69,14 +69,14 @@ class Atlas:
             self.successor = None
 
     def _take_over(self, front: FrontEndFrame) -> SlamState:
-        """A bent map ends for good: near the bend nothing in it is certain. Its newest frames and tracks are the next map's."""
+        """A bent map ends for good: near the bend nothing in it is certain. Next is the one that is ready, or begins with its tracks."""
         bent, ready, self.successor = self.active, self.successor, None
         self.left += [] if self._is_young(bent) else [bent]
         if ready is not None and ready.map.num_keyframes and ready.process_frame(front) is SlamState.TRACKING:
             self.active = ready
-            return SlamState.TRACKING
-        self.active = self._new_map()
-        self.active.succeed_to(bent)
+        else:
+            self.active = self._new_map()
+            self.active.succeed_to(bent)
         bent.heritage.clear()
         return self.active.state
 
@@ -107,7 +107,7 @@ class Atlas:
 
     def _has_held(self, slam: Slam) -> bool:
         """Whether a map that is not young has enough frames that the active one does not have."""
-        return not self._is_young(slam) and slam.num_frames_beyond(self.active) >= self.config.atlas.min_frames
+        return not self._is_young(slam) and slam.poses.num_beyond(self.active.poses) >= self.config.atlas.min_frames
 
     def _new_map(self) -> Slam:
         slam = Slam(self.camera, self.config, self._born, self.times)

@@ -377,18 +377,13 @@ class Slam:
                 self.poses.shift(index, k / (len(self._turned_frames) + 1) * way, self.map)
         self._turned_frames.clear()
 
-    def num_frames_beyond(self, other: "Slam") -> int:
-        """How many frames are localised in this map and not in the other."""
-        return self.poses.num_beyond(other.poses)
-
     def leave_to(self, other: "Slam") -> bool:
         """What the map that followed knows too is its own: before the camera was lost here it hung on little, there nothing had been lost.
 
-        Frames of a turn that no landmark ended are, where the other has them; and all since its first one, and since the last sound
-        keyframe here. Whether anything is left.
+        All since its first frame is, frames of a turn that no landmark ended among them; and what came after the last sound keyframe here
+        is nobody's. Whether anything is left.
         """
         self.heritage.clear()
-        self.poses.forget([index for index in self._turned_frames if index in other.poses])
         first = other.poses.first_frame
         last_sound = self._motion_check.last_sound(self.map, self.camera)
         keyframe = min(int(np.searchsorted(self.map.frame_indices, first)) - 1, last_sound)

@@ -48,10 +48,6 @@ class PoseLog:
         """Index of the earliest frame."""
         return min(self._row_of_frame)
 
-    def num_before(self, frame_index: int) -> int:
-        """How many frames come before one."""
-        return sum(index < frame_index for index in self._row_of_frame)
-
     def forget(self, frame_indices: Iterable[int]) -> None:
         """Takes frames out of the log."""
         for index in frame_indices:
