@@ -29,7 +29,7 @@ def main(argv: list[str] | None = None) -> int:
         atlas.process_frame(front_end.process(frame))
     atlas.finish()  # adjusts each whole map once more
     if not atlas.ranked():
-        print(f"no map: {atlas.current.initialization_reason}", file=sys.stderr)
+        print(f"no map: {atlas.current.initializer.reason}", file=sys.stderr)
         return 3
 
     output.write_config(config)
@@ -44,7 +44,8 @@ def main(argv: list[str] | None = None) -> int:
         folder = output.map_folder(number)
         folder.write_trajectories(slam.trajectory(), slam.keyframe_trajectory(), scale)
         folder.write_cloud(point_cloud(slam.map, slam.camera, config.cloud, config.snapshot), scale, "")
-        missing = folder.write_surfaces(*reconstruction.surfaces(), scale, reconstruction.voxel_lengths(), reconstruction.filter_remark)
+        surfaces, volumes = reconstruction.surfaces(), reconstruction.volumes
+        missing = folder.write_surfaces(*surfaces, scale, volumes.voxel_lengths(), volumes.filter_remark)
         empty += missing if number == 1 else []
         print(f"{len(slam.trajectory())} of {len(dataset)} frames localised, {slam.map.num_keyframes} keyframes: {folder.path}")
     if empty:

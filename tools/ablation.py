@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """Measures what each ingredient of the tracker and the map is worth: the default, and each ingredient off, one at a time.
 
-    python tools/ablation.py SOURCE --output docs/ablation.md
+    python tools/ablation.py SOURCE --output ablation.md
     python tools/ablation.py SOURCE --seeds 1 --only default --only coasting --score-tracks
 
 Runs the sparse half alone, one frame after the other, once per seed, and writes a Markdown table. SOURCE needs a ground

@@ -15,6 +15,7 @@ and the last time, "at the end".
 
 import argparse
 import dataclasses
+import itertools
 import json
 import os
 import platform
@@ -35,24 +36,24 @@ from vitamin3d.bundle_adjustment.adjust import adjust_bundle
 from vitamin3d.bundle_adjustment.marginalization import CameraPrior
 from vitamin3d.bundle_adjustment.problem import BundleProblem
 from vitamin3d.commands.process import keep_freed_memory
-from vitamin3d.config import Config, live_config, load_toml, paper_config
+from vitamin3d.config import BundleAdjustmentConfig, Config, live_config, load_toml, paper_config
 from vitamin3d.datasets import Dataset, Unreadable, open_dataset
 from vitamin3d.errors import InputError, Vitamin3dError
 from vitamin3d.exporters.files import write_file
 from vitamin3d.exporters.line_plot import Axes, Line, line_plot
+from vitamin3d.geometry.camera import Camera
 from vitamin3d.map_output import with_voxels
 from vitamin3d.mapping.landmark_statistics import information_by_id
-from vitamin3d.mapping.window_adjustment import WindowAdjustment
-from vitamin3d.mapping.window_selection import Window
 from vitamin3d.reconstruction import Reconstruction
 from vitamin3d.run_statistics import step_table, versions
 from vitamin3d.scale import Scale, scale_from_ground_truth
 from vitamin3d.slam import Slam
+from vitamin3d.slam_steps import SlamSteps
 from vitamin3d.tracking.front_end import FrontEnd
-from vitamin3d.types import Frame, StepTimes
+from vitamin3d.types import BundleReport, Frame, StepTimes
 from vitamin3d.warmup import warm_up
 
-SCHUR_INTERVAL = 10
+SCHUR_INTERVAL = 5
 MEMORY_INTERVAL = 250
 EXTRACTIONS = 10
 """The surfaces are extracted so often in the course of a run."""
@@ -82,20 +83,21 @@ class Looped:
         return frame if isinstance(frame, Unreadable) else dataclasses.replace(frame, index=index, timestamp_ns=index * self._period)
 
 
-class TimedSlam(Slam):
-    """Times its steps by CPU, and solves some of its windows by the Schur complement too, for comparison only."""
+def timed_slam(dataset: Dataset | Looped, config: Config, rival: StepTimes | None) -> Slam:
+    """A `Slam` that times its steps by CPU, and solves some of its windows by the Schur complement too, for comparison only."""
+    schur, count = dataclasses.replace(config.bundle_adjustment, keyframe_solver="schur"), itertools.count(1)
 
-    def __init__(self, dataset: Dataset | Looped, config: Config, rival: StepTimes | None) -> None:
-        super().__init__(dataset.camera, config)
-        self.times.clock = time.thread_time
-        self._rival = rival
-        self._schur = dataclasses.replace(config.bundle_adjustment, keyframe_solver="schur")
+    def solve(
+        problem: BundleProblem, camera: Camera, settings: BundleAdjustmentConfig, prior: CameraPrior | None = None
+    ) -> tuple[BundleProblem, BundleReport]:
+        if rival is not None and next(count) % SCHUR_INTERVAL == 0:
+            with rival.timed(SCHUR):
+                adjust_bundle(problem, camera, schur, prior)
+        return adjust_bundle(problem, camera, settings, prior)
 
-    def _solved(self, window: Window, problem: BundleProblem, prior: CameraPrior | None) -> WindowAdjustment:
-        if self._rival is not None and self.map.num_keyframes % SCHUR_INTERVAL == 0:
-            with self._rival.timed(SCHUR):
-                adjust_bundle(problem, self.camera, self._schur, prior)
-        return super()._solved(window, problem, prior)
+    slam = Slam(dataset.camera, config, steps=SlamSteps(solve=solve))
+    slam.times.clock = time.thread_time
+    return slam
 
 
 @dataclasses.dataclass
@@ -103,7 +105,7 @@ class Measured:
     """What a benchmark gathers."""
 
     front_end: FrontEnd
-    slam: TimedSlam
+    slam: Slam
     others: StepTimes
     live_points: list[int]
     sparse_seconds: float = 0.0
@@ -116,7 +118,7 @@ def run_sparse(dataset: Dataset | Looped, frames: int, config: Config, with_riva
     cv2.setNumThreads(1)
     keep_freed_memory()  # as the command line does
     others = StepTimes(clock=time.thread_time)
-    made = Measured(FrontEnd(config), TimedSlam(dataset, config, others if with_rivals else None), others, [])
+    made = Measured(FrontEnd(config), timed_slam(dataset, config, others if with_rivals else None), others, [])
     made.front_end.times.clock = time.thread_time
     previous: Frame | None = None
     for index in range(frames):
@@ -154,7 +156,7 @@ def run_dense(dataset: Dataset, made: Measured, config: Config, scale: Scale) ->
             with reconstruction.times.timed("snapshot"):
                 snapshot = made.slam.snapshot(keyframe, frame, by_id)
             reconstruction.add_keyframe(snapshot)
-        if keyframe % (1 + count // EXTRACTIONS) == count // EXTRACTIONS and reconstruction.low is not None:
+        if keyframe % (1 + count // EXTRACTIONS) == count // EXTRACTIONS and reconstruction.volumes.low is not None:
             extra_seconds += extraction_seconds(reconstruction)
     reconstruction.surfaces()
     made.dense_seconds = time.thread_time() - begun - extra_seconds
@@ -164,7 +166,7 @@ def run_dense(dataset: Dataset, made: Measured, config: Config, scale: Scale) ->
 def extraction_seconds(reconstruction: Reconstruction) -> float:
     """Extracts both surfaces as they are by now, timed as steps; what it took."""
     begun = time.thread_time()
-    reconstruction.surfaces_so_far()
+    reconstruction.volumes.surfaces()
     return time.thread_time() - begun
 
 
@@ -174,7 +176,7 @@ def benchmark(dataset: Dataset, frames: int | None, config: Config) -> dict[str,
     count = min(len(dataset), frames or len(dataset))
     made = run_sparse(dataset, count, config, True, lambda done, slam, settled: None)
     if made.slam.map.num_keyframes == 0:
-        raise InputError(f"{dataset.name}: no map: {made.slam.initialization_reason}")
+        raise InputError(f"{dataset.name}: no map: {made.slam.initializer.reason}")
     has_truth = dataset.ground_truth() is not None
     scale = scale_from_ground_truth(made.slam.trajectory(), dataset.ground_truth()) if has_truth else Scale()
     reconstruction = run_dense(dataset, made, config, scale)
@@ -188,7 +190,7 @@ def benchmark(dataset: Dataset, frames: int | None, config: Config) -> dict[str,
         "keyframes": made.slam.map.num_keyframes,
         "landmarks": int(np.isfinite(made.slam.map.points_world[:, 0]).sum()),
         "live_points": float(np.median(made.live_points)),
-        "voxels": [scale.metres_per_unit * length for length in reconstruction.voxel_lengths()],
+        "voxels": [scale.metres_per_unit * length for length in reconstruction.volumes.voxel_lengths()],
         "unit": scale.unit if scale.is_known else "map unit",
         "rows": rows(made, reconstruction),
         "steps": steps,
@@ -261,7 +263,7 @@ def loop(dataset: Dataset, frames: int, config: Config, with_dense: bool = False
                     "landmarks": landmarks,
                     "observations": len(slam.map.obs_landmark),
                     "tracked": len(slam.poses),
-                    "views": len(reconstruction.median_depths),
+                    "views": len(reconstruction.volumes.median_depths),
                     "cpu_seconds": round(time.process_time(), 1),
                 }
             )

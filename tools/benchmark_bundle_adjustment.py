@@ -24,13 +24,14 @@ from typing import Any
 
 import numpy as np
 
-from vitamin3d.bundle_adjustment.adjust import SOLVERS, AdjustmentSettings, adjust
+from vitamin3d.bundle_adjustment.adjust import SOLVERS, AdjustmentSettings, adjust, adjust_bundle
+from vitamin3d.bundle_adjustment.marginalization import CameraPrior
 from vitamin3d.bundle_adjustment.problem import BundleProblem, make_problem
 from vitamin3d.bundle_adjustment.rejection import reject
 from vitamin3d.bundle_adjustment.self_calibration import adjust_with_intrinsics
 from vitamin3d.bundle_adjustment.subspace import new_scratch, sweep_cameras, sweep_points
 from vitamin3d.bundle_adjustment.variables import Variables, free_slots, pinhole_model, sightings_of
-from vitamin3d.config import Config
+from vitamin3d.config import BundleAdjustmentConfig, Config
 from vitamin3d.datasets import Dataset, Unreadable, open_dataset
 from vitamin3d.datasets.bal import read_bal
 from vitamin3d.errors import InputError, Vitamin3dError
@@ -40,8 +41,9 @@ from vitamin3d.geometry.se3 import exp_se3, inverse, log_so3, transform_points
 from vitamin3d.geometry.sim3_alignment import align_sim3
 from vitamin3d.mapping.window_selection import build_problem, select_window, whole_map
 from vitamin3d.slam import Slam
+from vitamin3d.slam_steps import SlamSteps
 from vitamin3d.tracking.front_end import FrontEnd
-from vitamin3d.types import Array
+from vitamin3d.types import Array, BundleReport
 
 REPEATS = 5
 NEAR_SHARE, POSE_SHARE = 0.01, 0.05
@@ -104,22 +106,6 @@ def ceres_solver() -> Callable[..., Any] | None:
 # --- windows of a real run ---------------------------------------------------------------------------------------
 
 
-class RecordingSlam(Slam):
-    """Saves the problem of the window, as the tracker starts it, at some keyframes; its ideal pixels are of `camera`."""
-
-    folder, every = Path(), 30
-    truth: "SequenceTruth | None" = None
-
-    def _adjust_window(self) -> None:
-        if self.map.num_keyframes % self.every == 0:
-            window = select_window(self.map, self.config.window)
-            problem = build_problem(self.map, window)
-            times = np.array(self.map.timestamps_ns, np.int64)[window.keyframes]
-            truth = None if self.truth is None else self.truth.of(problem, times, self.camera)
-            save_problem(self.folder / f"window_{self.map.num_keyframes:04d}.npz", problem, self.camera, truth)
-        super()._adjust_window()
-
-
 class SequenceTruth:
     """True poses of a sequence and its depth maps."""
 
@@ -155,8 +141,19 @@ def record(source: str, folder: Path, keyframes: int, anchors: int, every: int, 
     if isinstance(dataset, Unreadable):
         raise InputError(f"{source}: {dataset.reason}")
     folder.mkdir(parents=True, exist_ok=True)
-    slam = RecordingSlam(dataset.camera, config)
-    slam.folder, slam.every, slam.truth = folder, every, SequenceTruth(dataset, Path(source))
+    truth = SequenceTruth(dataset, Path(source))
+
+    def solve(
+        problem: BundleProblem, camera: Camera, settings: BundleAdjustmentConfig, prior: CameraPrior | None = None
+    ) -> tuple[BundleProblem, BundleReport]:
+        """Saves the problem of the window, as the mapper starts it, at some keyframes; its ideal pixels are of `camera`."""
+        count = slam.map.num_keyframes
+        if count % every == 0:
+            times = np.array(slam.map.timestamps_ns, np.int64)[select_window(slam.map, config.window).keyframes]
+            save_problem(folder / f"window_{count:04d}.npz", problem, camera, truth.of(problem, times, camera))
+        return adjust_bundle(problem, camera, settings, prior)
+
+    slam = Slam(dataset.camera, config, steps=SlamSteps(solve=solve))
     front_end = FrontEnd(config)
     for index in range(min(frames, len(dataset))):
         frame = dataset.read(index)

@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """How the steps' CPU times grow: with points, pixels, keyframes of a window, and voxels. Four curves in one picture.
 
-    python tools/benchmark_scaling.py SEQUENCE --plot docs/scaling.svg --json scaling.json
+    python tools/benchmark_scaling.py SEQUENCE --plot scaling.svg --json scaling.json
 
 Points: prediction and climb of so many random pixels between two frames, beside OpenCV's KLT of the same pixels. Image: the
 front end on the resized picture. Window: the adjustment of so many keyframes with their anchors, six iterations, from the
@@ -107,7 +107,7 @@ def window_curves(slam: Slam) -> Curves:
 
 def voxel_curves(reconstruction: Reconstruction, views: Sequence[DepthView], scale: Scale) -> Curves:
     curves: Curves = {}
-    fusion = reconstruction.config.fusion
+    fusion = reconstruction.volumes.config.fusion
     for centimetres in VOXELS_CM:
         length = centimetres / 100.0 / scale.metres_per_unit
         for backend in ("blocks", "scalable"):

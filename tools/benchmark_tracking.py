@@ -25,7 +25,7 @@ from vitamin3d.commands.process import keep_freed_memory
 from vitamin3d.config import Config, load_toml, paper_config
 from vitamin3d.datasets import Dataset, Unreadable, open_dataset
 from vitamin3d.errors import InputError, Vitamin3dError
-from vitamin3d.tracking.extrema import refine_extrema, select_free_extrema
+from vitamin3d.image.extrema import refine_extrema, select_free_extrema
 from vitamin3d.tracking.extrema_tracking import predict_by_dense_flow, predict_by_dominant_flow, track_extrema
 from vitamin3d.tracking.front_end import FrontEnd
 from vitamin3d.types import Array, Frame, FrontEndFrame, StepTimes, Tracks

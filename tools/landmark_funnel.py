@@ -9,6 +9,8 @@ A track is counted once, when it was detected; what became of its landmark is as
 import argparse
 import sys
 from collections import Counter
+from collections.abc import Iterator
+from contextlib import contextmanager
 from pathlib import Path
 
 import cv2
@@ -18,11 +20,15 @@ from vitamin3d.config import Config, load_toml
 from vitamin3d.datasets import Unreadable, open_dataset
 from vitamin3d.errors import InputError, Vitamin3dError
 from vitamin3d.exporters.files import write_file
+from vitamin3d.geometry.camera import Camera
+from vitamin3d.localization.localizer import Localizer
 from vitamin3d.mapping.landmark_statistics import keyframe_vertices, landmark_information, landmark_statistics, relative_depth_deviations
 from vitamin3d.mapping.visible_landmarks import with_unobserved
 from vitamin3d.slam import Slam
+from vitamin3d.slam_steps import SlamSteps
 from vitamin3d.tracking.extrema_tracking import predict_by_dense_flow
 from vitamin3d.tracking.front_end import FrontEnd
+from vitamin3d.tracking.tracker import Tracker, TrackIds
 from vitamin3d.types import Array, FrontEndFrame, Tracks
 
 STAGES = (
@@ -50,44 +56,33 @@ VISIBLE_STRIDE = 4
 """Of the keyframes in which the landmarks in view are counted."""
 
 
-class FunnelSlam(Slam):
-    """`Slam` that keeps account of why tracks end."""
+class FunnelTracker(Tracker):
+    """`Tracker` that keeps account of why tracks end."""
 
-    def __init__(self, *arguments: object) -> None:
-        super().__init__(*arguments)  # type: ignore[arg-type]
+    def __init__(self, camera: Camera, config: Config, ids: TrackIds | None = None) -> None:
+        super().__init__(camera, config, ids)
         self.ends: Counter[str] = Counter()
-        self.ever_mapped: set[int] = set()
-        self.frames_seen: Counter[int] = Counter()
         self.second_lives = 0
         """Landmarks found again after their track had ended, tracks that go on after another picture came between."""
-        self._known, self._before = self.tracks.ids, self.tracks
+        self.reason_of_ends = REASONS[4]
+        self._known, self._followed = self.tracks.ids, self.tracks
 
-    def _account(self, reason: str) -> int:
-        """Books the tracks that are gone since the last time under a reason; how many."""
-        lost = len(np.setdiff1d(self._known, self.tracks.ids))
-        self.ends[reason] += lost
+    def _account(self, reason: str) -> None:
+        """Books the tracks that are gone since the last time under a reason, and those that have come as second lives."""
+        self.ends[reason] += len(np.setdiff1d(self._known, self.tracks.ids))
+        self.second_lives += len(np.setdiff1d(self.tracks.ids, self._known))
         self._known = self.tracks.ids
-        return lost
-
-    def process_frame(self, front: FrontEndFrame):  # type: ignore[no-untyped-def]
-        state = super().process_frame(front)
-        seen = self.tracks.ids[self.tracks.missed == 0]
-        self.frames_seen.update(seen.tolist())
-        self.ever_mapped.update(seen[self.map.is_mapped(seen)].tolist())
-        return state
 
     def _resume(self, followed: int | None) -> bool:
         is_resumed = super()._resume(followed)
-        self._before = self.tracks if is_resumed else Tracks.empty()
-        self.ends[REASONS[7]] += len(np.setdiff1d(self._known, self._before.ids))
-        self.second_lives += len(np.setdiff1d(self._before.ids, self._known))
-        self._known = self._before.ids
+        self.tracks = self.tracks if is_resumed else Tracks.empty()
+        self._account(REASONS[7])
         return is_resumed
 
-    def _track(self, front: FrontEndFrame):  # type: ignore[no-untyped-def]
-        self._before, config = self.tracks, self.config.extrema_tracking
-        self.tracks = super()._track(front)
-        before = self._before
+    def follow(self, front: FrontEndFrame, measures_motion: bool) -> tuple[int, Array] | None:
+        self._followed, config = Tracks.empty(), self.config.extrema_tracking
+        motion = super().follow(front, measures_motion)
+        before = self._followed
         lost = ~np.isin(before.ids, self.tracks.ids)
         predicted = before.pixels
         if front.dense_flow is not None:
@@ -97,35 +92,73 @@ class FunnelSlam(Slam):
         vanished = lost & ~left & (before.missed == config.coast_frames)
         self.ends.update({REASONS[0]: int(left.sum()), REASONS[1]: int(vanished.sum()), REASONS[2]: int((lost & ~left & ~vanished).sum())})
         self._known = self.tracks.ids
-        return self.tracks
+        return motion
 
-    def _refill(self, front: FrontEndFrame) -> None:
-        super()._refill(front)
+    def _climbed(self, predicted: Array, front: FrontEndFrame) -> Tracks:
+        self._followed = self.tracks
+        return super()._climbed(predicted, front)
+
+    def refill(self, front: FrontEndFrame) -> None:
+        super().refill(front)
         self._known = self.tracks.ids
 
-    def _localize(self, front: FrontEndFrame):  # type: ignore[no-untyped-def]
-        pose = super()._localize(front)
-        self._account(REASONS[7] if pose is None else REASONS[3])
-        return pose
+    def take_up(self, tracks: Tracks) -> None:
+        is_merge = tracks.pixels is self.tracks.pixels
+        super().take_up(tracks)
+        self._account(REASONS[6] if is_merge else REASONS[5])
 
-    def _recover(self, *arguments: object) -> int:  # type: ignore[override]
-        self._account(REASONS[3] if len(self.tracks) else REASONS[7])
-        count = super()._recover(*arguments)  # type: ignore[arg-type]
-        self._account(REASONS[5])
-        self.second_lives += count
-        return count
+    def end(self, ids: Array) -> None:
+        super().end(ids)
+        self._account(self.reason_of_ends)
 
-    def _merge_landmarks(self, T_cam_world: Array) -> None:
-        super()._merge_landmarks(T_cam_world)
-        self.second_lives += self._account(REASONS[6])
-
-    def _adjust_window(self) -> None:
-        super()._adjust_window()
-        self._account(REASONS[4])
+    def end_all(self) -> None:
+        super().end_all()
+        self._account(REASONS[7])
 
 
-def stages(slam: FunnelSlam) -> dict[str, int]:
+class FunnelLocalizer(Localizer):
+    """`Localizer` whose outliers are booked as such."""
+
+    tracker: FunnelTracker
+
+    def locate(self, front: FrontEndFrame) -> Array | None:
+        with self._booking():
+            return super().locate(front)
+
+    def refine(self, T_cam_world: Array) -> Array:
+        with self._booking():
+            return super().refine(T_cam_world)
+
+    @contextmanager
+    def _booking(self) -> Iterator[None]:
+        before, self.tracker.reason_of_ends = self.tracker.reason_of_ends, REASONS[3]
+        yield
+        self.tracker.reason_of_ends = before
+
+
+class Funnel:
+    """Counts what becomes of the tracks of a sequence."""
+
+    def __init__(self, camera: Camera, config: Config) -> None:
+        self.slam = Slam(camera, config, steps=SlamSteps(FunnelTracker, FunnelLocalizer))  # type: ignore[arg-type]
+        self.ever_mapped: set[int] = set()
+        self.frames_seen: Counter[int] = Counter()
+
+    @property
+    def tracker(self) -> FunnelTracker:
+        assert isinstance(self.slam.tracker, FunnelTracker)
+        return self.slam.tracker
+
+    def process_frame(self, front: FrontEndFrame) -> None:
+        self.slam.process_frame(front)
+        seen = self.slam.tracks.ids[self.slam.tracks.missed == 0]
+        self.frames_seen.update(seen.tolist())
+        self.ever_mapped.update(seen[self.slam.map.mapped(seen)[0]].tolist())
+
+
+def stages(funnel: Funnel) -> dict[str, int]:
     """How many tracks reached each stage; every stage is a part of the one before, from `landmark at the end` on."""
+    slam = funnel.slam
     statistics = landmark_statistics(slam.map, slam.camera)
     ids = np.flatnonzero(~np.isnan(slam.map.points_world[:, 0]))
     keyframes, parallax = statistics.num_observations[ids] >= 3, statistics.parallax_deg[ids]
@@ -133,14 +166,14 @@ def stages(slam: FunnelSlam) -> dict[str, int]:
     last = slam.map.T_cam_world[slam.map.keyframe_of(slam.map.last_observation[ids])]
     sure = relative_depth_deviations(information, slam.map.points_world[ids], last) < MAX_DEVIATION
     counts = (
-        len(slam.frames_seen), sum(n >= MIN_FRAMES for n in slam.frames_seen.values()), len(slam.ever_mapped), len(ids),
+        len(funnel.frames_seen), sum(n >= MIN_FRAMES for n in funnel.frames_seen.values()), len(funnel.ever_mapped), len(ids),
         int(keyframes.sum()), int((keyframes & (parallax > 2)).sum()), int((keyframes & (parallax > 5)).sum()),
         int((keyframes & (parallax > 5) & sure).sum()),
     )  # fmt: skip
     return dict(zip(STAGES, counts, strict=True))
 
 
-def good_per_keyframe(slam: FunnelSlam) -> float:
+def good_per_keyframe(slam: Slam) -> float:
     """Median number of landmarks with three observations and a deviation below 5 % of the depth that a keyframe observes."""
     ids = np.flatnonzero(~np.isnan(slam.map.points_world[:, 0]) & (slam.map.num_observations >= 3))
     information = landmark_information(slam.map, ids, slam.camera, slam.config.snapshot)
@@ -154,7 +187,7 @@ def good_per_keyframe(slam: FunnelSlam) -> float:
     return float(np.median(counts)) if counts else 0.0
 
 
-def visible_per_keyframe(slam: FunnelSlam) -> float:
+def visible_per_keyframe(slam: Slam) -> float:
     """Median number of such landmarks that a keyframe sees, those included that it does not observe and nothing nearer hides."""
     config, counts = slam.config.snapshot, []
     for k in range(0, slam.map.num_keyframes, VISIBLE_STRIDE):
@@ -163,29 +196,29 @@ def visible_per_keyframe(slam: FunnelSlam) -> float:
     return float(np.median(counts)) if counts else 0.0
 
 
-def measure(source: Path, frames: int | None, config: Config) -> FunnelSlam:
+def measure(source: Path, frames: int | None, config: Config) -> Funnel:
     """The sequence tracked and mapped, with its account."""
     dataset = open_dataset(source)
-    front_end, slam = FrontEnd(config), FunnelSlam(dataset.camera, config)
+    front_end, funnel = FrontEnd(config), Funnel(dataset.camera, config)
     for index in range(min(len(dataset), frames or len(dataset))):
         frame = dataset.read(index)
         if not isinstance(frame, Unreadable):
-            slam.process_frame(front_end.process(frame))
-    slam.finish()
-    return slam
+            funnel.process_frame(front_end.process(frame))
+    funnel.slam.finish()
+    return funnel
 
 
-def table(columns: dict[str, FunnelSlam]) -> str:
+def table(columns: dict[str, Funnel]) -> str:
     """Markdown: a column per sequence."""
     lines = ["| | " + " | ".join(columns) + " |", "|---" * (len(columns) + 1) + "|"]
-    reached = {name: stages(slam) for name, slam in columns.items()}
+    reached = {name: stages(funnel) for name, funnel in columns.items()}
     lines += [f"| {stage} | " + " | ".join(f"{reached[name][stage]:,}" for name in columns) + " |" for stage in STAGES]
-    good = " | ".join(f"{good_per_keyframe(slam):,.0f}" for slam in columns.values())
+    good = " | ".join(f"{good_per_keyframe(funnel.slam):,.0f}" for funnel in columns.values())
     lines.append(f"| good (3 keyframes, deviation < 5 %) observed by a keyframe, median | {good} |")
-    visible = " | ".join(f"{visible_per_keyframe(slam):,.0f}" for slam in columns.values())
+    visible = " | ".join(f"{visible_per_keyframe(funnel.slam):,.0f}" for funnel in columns.values())
     lines.append(f"| good and in view, observed or not, none of them hidden, median | {visible} |")
     for reason in REASONS:
-        shares = (slam.ends[reason] / max(1, sum(slam.ends.values())) for slam in columns.values())
+        shares = (funnel.tracker.ends[reason] / max(1, sum(funnel.tracker.ends.values())) for funnel in columns.values())
         lines.append(f"| tracks that ended: {reason} | " + " | ".join(f"{100 * share:.1f} %" for share in shares) + " |")
     return "\n".join(lines) + "\n"
 

@@ -9,20 +9,25 @@ import numpy as np
 
 from vitamin3d.config import Config
 from vitamin3d.geometry.camera import Camera
-from vitamin3d.mapping.window_adjustment import AdjustAtOnce, Adjuster
+from vitamin3d.mapping.window_adjustment import SharedAdjuster
 from vitamin3d.slam import Slam
+from vitamin3d.slam_steps import SlamSteps
+from vitamin3d.succession import leave, succeed
+from vitamin3d.tracking.tracker import TrackIds
 from vitamin3d.types import Frame, FrameNote, FrontEndFrame, SlamState, StepTimes
 
 
 class Atlas:
     """Never gives up: tracks a sequence through as many maps as it takes."""
 
-    def __init__(self, camera: Camera, config: Config) -> None:
-        self.camera, self.config = camera, config
+    def __init__(self, camera: Camera, config: Config, steps: SlamSteps | None = None) -> None:
+        self.camera, self.config, self.steps = camera, config, steps
         self.times = StepTimes()
         self.notes: list[FrameNote] = []
         """One per frame processed."""
-        self.adjuster: Adjuster = AdjustAtOnce()
+        self.adjuster = SharedAdjuster()
+        """Of the windows of all maps."""
+        self._track_ids = TrackIds()
         self._born = 0
         self.left: list[Slam] = []
         """Maps in which the camera was lost and that another one followed."""
@@ -76,7 +81,7 @@ class Atlas:
             self.active = ready
         else:
             self.active = self._new_map()
-            self.active.succeed_to(bent)
+            succeed(self.active, bent)
         bent.heritage.clear()
         return self.active.state
 
@@ -94,7 +99,7 @@ class Atlas:
         return state
 
     def _hand_over_to(self, slam: Slam) -> None:
-        is_left = self.active.leave_to(slam) and not self._is_young(self.active)
+        is_left = leave(self.active, slam) and not self._is_young(self.active)
         self.left += [self.active] if is_left else []
         self.active, self.successor = slam, None
 
@@ -103,18 +108,17 @@ class Atlas:
         slam = self._new_map()
         if other is None or len(other.heritage) < 2:
             return slam, slam.process_frame(front)
-        return slam, slam.succeed_to(other)
+        return slam, succeed(slam, other)
 
     def _has_held(self, slam: Slam) -> bool:
         """Whether a map that is not young has enough frames that the active one does not have."""
         return not self._is_young(slam) and slam.poses.num_beyond(self.active.poses) >= self.config.atlas.min_frames
 
     def _new_map(self) -> Slam:
-        slam = Slam(self.camera, self.config, self._born, self.times)
+        slam = Slam(self.camera, self.config, self._born, self.times, self._track_ids, self.adjuster, self.steps)
         older = [other for other in self._all() if not self._is_young(other)] if self._born else []
         if older:
-            slam.inherit(max(older, key=lambda other: len(other.poses)))
-        slam.adjuster = self.adjuster
+            slam.mapper.inherit(max(older, key=lambda other: len(other.poses)).mapper)
         self._born += 1
         return slam
 
@@ -126,7 +130,8 @@ class Atlas:
 
     def _is_false(self, slam: Slam) -> bool:
         """Whether most tracks that show parallax contradict the map: it may be that of something that moves."""
-        return slam.rigidity.num_tracks >= self.config.atlas.judged_tracks and slam.rigidity.share < self.config.atlas.min_rigid_share
+        rigidity = slam.mapper.rigidity
+        return rigidity.num_tracks >= self.config.atlas.judged_tracks and rigidity.share < self.config.atlas.min_rigid_share
 
     def _note(self, front: FrontEndFrame, state: SlamState) -> FrameNote:
         flow, slam, frame = front.dense_flow, self.current, front.frame
@@ -135,14 +140,8 @@ class Atlas:
         num_tracks = int((slam.tracks.missed == 0).sum())
         return FrameNote(
             frame.index, frame.timestamp_ns, state, slam.number, len(front.extrema), num_tracks, float(small.std()), float(small.mean()),
-            front.follows is not None, motion, slam.initialization_reason,
+            front.follows is not None, motion, slam.initializer.reason,
         )  # fmt: skip
-
-    def use_adjuster(self, adjuster: Adjuster) -> None:
-        """Windows of all maps are adjusted by it from now on."""
-        self.adjuster = adjuster
-        for slam in self._all():
-            slam.adjuster = adjuster
 
     def take_adjustment(self, wait: bool = False) -> None:
         """The window that was adjusted meanwhile enters the active map."""
@@ -150,7 +149,7 @@ class Atlas:
 
     @property
     def adjustments_awaited(self) -> int:
-        return sum(slam.adjustments_awaited for slam in self._all())
+        return sum(slam.mapper.adjustment.num_awaited for slam in self._all())
 
     def finish(self) -> None:
         """The adjustment of each whole map at the end of a recording; the next map goes on if there is one."""

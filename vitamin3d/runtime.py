@@ -141,7 +141,7 @@ class _Run:
         seen = slam.tracks.select(slam.tracks.missed == 0)
         self.record.live_tracks.append(len(seen))
         if self.record.tracks is not None:
-            self.record.tracks.append((frame_index, slam.unique_ids(seen.ids), seen.pixels))
+            self.record.tracks.append((frame_index, seen.ids, seen.pixels))
 
 
 def run_sequential(
@@ -213,8 +213,8 @@ def run_live(
         dense = threads.enter_context(Consumer(consume, "dense", LIVE_SNAPSHOTS_AHEAD, DENSE_NICENESS)) if consume else None
         if clock is not None:
             adjuster: Errand[WindowAdjustment] = Errand("adjustment", ADJUSTMENT_NICENESS)
-            atlas.use_adjuster(threads.enter_context(adjuster))
-            threads.callback(lambda: atlas.use_adjuster(AdjustAtOnce()))
+            atlas.adjuster.work_with(threads.enter_context(adjuster))
+            threads.callback(lambda: atlas.adjuster.work_with(AdjustAtOnce()))
         fronts = threads.enter_context(_fronts_ahead(threads, _pictures(dataset, indices), front_end, record, clock))
         if clock is not None:
             threads.callback(clock.cancel)

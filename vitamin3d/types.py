@@ -81,7 +81,7 @@ class Tracks:
     """The live tracks of one frame; arrays of one length N, sorted by nothing."""
 
     ids: Array
-    """(N,) int64, unique; the id of a track is the id of its landmark."""
+    """(N,) int64, never used again in a run; the id of a track is the id of its landmark."""
     pixels: Array
     """(N, 2) float64, distorted pixels."""
     kappa: Array
@@ -116,6 +116,25 @@ class Tracks:
     def concatenate(a: "Tracks", b: "Tracks") -> "Tracks":
         pairs = zip((a.ids, a.pixels, a.kappa, a.ages, a.missed), (b.ids, b.pixels, b.kappa, b.ages, b.missed), strict=True)
         return Tracks(*(np.concatenate(pair) for pair in pairs))
+
+
+@dataclass(frozen=True)
+class TrackedView:
+    """A frame with the tracks seen in it."""
+
+    frame: Frame
+    tracks: Tracks
+    """Without those that coast."""
+    ideal_pixels: Array
+    """(N, 2) of the tracks."""
+    image_motion: Array
+    """(6, 2) how the image moved (`geometry/rolling_shutter.py`)."""
+
+
+def shared_tracks(a: TrackedView, b: TrackedView) -> tuple[Array, Array]:
+    """Rows (N,) in a and rows (N,) in b of the tracks that both have."""
+    _, rows_a, rows_b = np.intersect1d(a.tracks.ids, b.tracks.ids, assume_unique=True, return_indices=True)
+    return rows_a, rows_b
 
 
 @dataclass(frozen=True)
@@ -223,6 +242,8 @@ class DepthView:
     """(H, W) float32 inverse variance of the depth, per squared map unit; 0 = none."""
     doubtful: Array = field(default_factory=lambda: np.zeros((0, 0), np.int32))
     """(H, W) int32 number of the triangle to be checked that covers a pixel, from 1; 0 = none. Empty: there are none."""
+    map_number: int = 0
+    """Of the map it belongs to, in the order of their births."""
 
 
 @dataclass(frozen=True)

@@ -18,8 +18,8 @@ from vitamin3d.geometry.camera import Camera
 from vitamin3d.geometry.rolling_shutter import ideal_pixels, measured_pixels
 from vitamin3d.geometry.se3 import inverse
 from vitamin3d.mapping.readout_estimation import estimate_readout, frame_interval_s
-from vitamin3d.mapping.sparse_map import SparseMap
 from vitamin3d.mapping.window_selection import Window, build_problem, spread_over_map, store_solution, whole_map
+from vitamin3d.sparse_map import SparseMap
 from vitamin3d.types import Array
 
 POINT_SWEEPS = 2

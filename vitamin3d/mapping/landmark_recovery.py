@@ -8,42 +8,13 @@ from vitamin3d.config import RecoveryConfig
 from vitamin3d.geometry.camera import Camera
 from vitamin3d.geometry.rolling_shutter import measured_pixels
 from vitamin3d.geometry.se3 import inverse
-from vitamin3d.mapping.sparse_map import PATCH_PX, SparseMap
-from vitamin3d.tracking.extrema import subpixel_offset
-from vitamin3d.tracking.extrema_tracking import climb
+from vitamin3d.image.extrema import subpixel_offset
+from vitamin3d.image.hill_climbing import climb
+from vitamin3d.image.patches import cut_patches, patch_similarity
+from vitamin3d.sparse_map import SparseMap
 from vitamin3d.types import Array, Tracks
 
 BORDER_PX = 10
-
-
-@kernel
-def _cut_patches(image, pixels, radius, out):  # type: ignore[no-untyped-def]
-    """Patches (N, P) uint8 around rounded pixels, clamped at the border."""
-    height, width = image.shape
-    for i in range(pixels.shape[0]):
-        u, v = int(round(pixels[i, 0])), int(round(pixels[i, 1]))
-        k = 0
-        for n in range(v - radius, v + radius + 1):
-            for m in range(u - radius, u + radius + 1):
-                out[i, k] = image[min(max(n, 0), height - 1), min(max(m, 0), width - 1)]
-                k += 1
-
-
-@kernel
-def _zncc(a, b, noise, out):  # type: ignore[no-untyped-def]
-    """Zero-mean normalised cross-correlation of patches (N, P) row by row; 0 where one has no contrast.
-
-    The variance of the noise is taken off those of the patches, half of each at most: it correlates with nothing.
-    """
-    for i in range(a.shape[0]):
-        n = a.shape[1]
-        sa, sb, saa, sbb, sab = 0.0, 0.0, 0.0, 0.0, 0.0
-        for k in range(n):
-            x, y = float(a[i, k]), float(b[i, k])
-            sa, sb, saa, sbb, sab = sa + x, sb + y, saa + x * x, sbb + y * y, sab + x * y
-        of_a, of_b, of_noise = saa - sa * sa / n, sbb - sb * sb / n, n * noise * noise
-        variance = max(of_a - of_noise, 0.5 * of_a) * max(of_b - of_noise, 0.5 * of_b)
-        out[i] = (sab - sa * sb / n) / np.sqrt(variance) if variance > 1e-6 else 0.0
 
 
 @kernel
@@ -59,25 +30,11 @@ def _climb_strict(kappa, predicted, max_steps, gate, out, found):  # type: ignor
             found[i] = (out[i, 0] - pu) ** 2 + (out[i, 1] - pv) ** 2 <= gate * gate
 
 
-def cut_patches(image: Array, pixels: Array) -> Array:
-    """Patches (N, 81) uint8 of a picture (H, W) uint8 around distorted pixels (N, 2)."""
-    out = np.empty((len(pixels), PATCH_PX * PATCH_PX), np.uint8)
-    _cut_patches(image, np.ascontiguousarray(pixels), PATCH_PX // 2, out)
-    return out
-
-
-def patch_similarity(a: Array, b: Array, noise: float = 0.0) -> Array:
-    """Zero-mean normalised cross-correlation (N,) of patches (N, P) uint8, in [-1, 1] but for noise of this deviation, grey levels."""
-    out = np.empty(len(a))
-    _zncc(a, b, noise, out)
-    return out
-
-
 @kernel
 def _list_candidates(  # type: ignore[no-untyped-def]
-    points, num_observations, last_observation, is_live, keyframe_starts, centres, pose, view, min_observations, min_cosine, max_ratio, ids
+    points, num_observations, last_observation, is_live, keyframe_starts, centres, pose, view, min_observations, min_cosine, max_ratio, rows
 ):
-    """Writes the ids of landmarks that `_visible_candidates` is about, and returns how many; `view` is fx fy cx cy width height,
+    """Writes the rows of landmarks that `_visible_candidates` is about, and returns how many; `view` is fx fy cx cy width height,
     `centres` (K + 1, 3) those of the keyframes' cameras and of this one in the world."""
     fx, fy, cx, cy, width, height = view
     count, here = 0, centres[-1]
@@ -87,9 +44,9 @@ def _list_candidates(  # type: ignore[no-untyped-def]
         u = fx * (pose[0, 0] * x + pose[0, 1] * y + pose[0, 2] * z + pose[0, 3]) + cx * depth
         v = fy * (pose[1, 0] * x + pose[1, 1] * y + pose[1, 2] * z + pose[1, 3]) + cy * depth
         is_shown = (depth > 0.0) & (u > 0.0) & (v > 0.0) & (u < width * depth) & (v < height * depth)
-        ids[count] = p
+        rows[count] = p
         count += is_shown & (not is_live[p]) & (num_observations[p] >= min_observations)
-    shown, count = ids[:count], 0
+    shown, count = rows[:count], 0
     for p in shown:
         k, span = 0, keyframe_starts.shape[0]  # the keyframe of the last observation, by bisection without a branch
         while span > 1:
@@ -102,24 +59,24 @@ def _list_candidates(  # type: ignore[no-untyped-def]
             dot, squared_then, squared_now = dot + a * b, squared_then + a * a, squared_now + b * b
         is_alike = dot > min_cosine * np.sqrt(squared_then * squared_now)
         if is_alike and squared_now < max_ratio**2 * squared_then and squared_then < max_ratio**2 * squared_now:
-            ids[count] = p
+            rows[count] = p
             count += 1
     return count
 
 
-def _visible_candidates(sparse_map: SparseMap, live_ids: Array, T_cam_world: Array, camera: Camera, config: RecoveryConfig) -> Array:
-    """Ids of landmarks, not tracked now, that were last seen from a similar direction and distance."""
+def _visible_candidates(sparse_map: SparseMap, live: Array, T_cam_world: Array, camera: Camera, config: RecoveryConfig) -> Array:
+    """Rows of landmarks, not among the `live` rows (N,), that were last seen from a similar direction and distance."""
     size, canvas = len(sparse_map.points_world), camera.whole_canvas
     view = camera.fx, camera.fy, canvas.cx, canvas.cy, canvas.width, canvas.height
-    is_live, ids = np.zeros(size, np.bool_), np.empty(size, np.int64)
-    is_live[live_ids[live_ids < size]] = True
+    is_live, rows = np.zeros(size, np.bool_), np.empty(size, np.int64)
+    is_live[live[(live >= 0) & (live < size)]] = True
     centres = np.ascontiguousarray(inverse(np.concatenate([sparse_map.T_cam_world, T_cam_world[None]]))[:, :3, 3])
     count = _list_candidates(
         sparse_map.points_world, sparse_map.num_observations, sparse_map.last_observation, is_live, np.array(sparse_map.keyframe_starts),
         centres, np.ascontiguousarray(T_cam_world), view,
-        config.min_observations, np.cos(np.radians(config.max_view_angle_deg)), config.max_distance_ratio, ids,
+        config.min_observations, np.cos(np.radians(config.max_view_angle_deg)), config.max_distance_ratio, rows,
     )  # fmt: skip
-    return ids[:count]
+    return rows[:count]
 
 
 def recover_landmarks(
@@ -138,18 +95,18 @@ def recover_landmarks(
         T_cam_world: (4, 4) of the frame.
         noise: deviation of the picture's noise, grey levels.
     """
-    ids = _visible_candidates(sparse_map, tracks.ids, T_cam_world, camera, config)
-    points = sparse_map.points_world.take(ids, axis=0)
+    live = sparse_map.rows_of(tracks.ids)
+    rows = _visible_candidates(sparse_map, live, T_cam_world, camera, config)
+    points = sparse_map.points_world.take(rows, axis=0)
     ideal = camera.ideal_from_points(points @ T_cam_world[:3, :3].T + T_cam_world[:3, 3])
     predicted = measured_pixels(ideal, image_motion, camera)
     inside = camera.is_inside(predicted, BORDER_PX)
-    ids, predicted = ids[inside], np.ascontiguousarray(predicted[inside])
+    rows, predicted = rows[inside], np.ascontiguousarray(predicted[inside])
     pixels, found = np.empty_like(predicted), np.empty(len(predicted), np.bool_)
     _climb_strict(kappa, predicted, int(config.gate_px) + 2, config.gate_px, pixels, found)
-    ids, pixels = ids[found], pixels[found]
-    agrees = patch_similarity(sparse_map.patches[ids], cut_patches(image, pixels), noise) > config.min_zncc
-    ids, pixels = ids[agrees], pixels[agrees]
-    return _take_up(tracks, sparse_map.is_mapped(tracks.ids), ids, pixels, kappa)
+    rows, pixels = rows[found], pixels[found]
+    agrees = patch_similarity(sparse_map.patches[rows], cut_patches(image, pixels), noise) > config.min_zncc
+    return _take_up(tracks, sparse_map.is_mapped(live), sparse_map.ids_of(rows[agrees]), pixels[agrees], kappa)
 
 
 def _take_up(tracks: Tracks, is_mapped: Array, ids: Array, pixels: Array, kappa: Array) -> tuple[Tracks, Array]:
@@ -175,16 +132,16 @@ def _take_up(tracks: Tracks, is_mapped: Array, ids: Array, pixels: Array, kappa:
 
 
 def same_landmarks(meetings: Array, tracks: Tracks, sparse_map: SparseMap, T_cam_world: Array, max_distance: float) -> Array:
-    """Of landmarks that met tracked ones (N, 2) the pairs (M, 2) that are one: near each other in space, relative to their depth.
+    """Of landmarks that met tracked ones, ids (N, 2), the pairs (M, 2) that are one: near each other in space, relative to their depth.
 
     With a largest distance of 0 there are none.
     """
     if max_distance == 0.0:
         return np.zeros((0, 2), np.int64)
-    usable = sparse_map.is_mapped(meetings[:, 0]) & sparse_map.is_mapped(meetings[:, 1])
+    usable = sparse_map.mapped(meetings[:, 0])[0] & sparse_map.mapped(meetings[:, 1])[0]
     usable &= np.isin(meetings[:, 1], tracks.ids) & ~np.isin(meetings[:, 0], tracks.ids)
     pairs = meetings[usable]
-    a, b = sparse_map.points_world[pairs[:, 0]], sparse_map.points_world[pairs[:, 1]]
+    a, b = (sparse_map.points_world[sparse_map.rows_of(ids)] for ids in pairs.T)
     depth = b @ T_cam_world[2, :3] + T_cam_world[2, 3]
     pairs = pairs[np.linalg.norm(a - b, axis=1) < max_distance * depth]
     for column in (0, 1):

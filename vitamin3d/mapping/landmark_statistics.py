@@ -11,7 +11,7 @@ from vitamin3d.config import CloudConfig, SnapshotConfig
 from vitamin3d.geometry.camera import Camera
 from vitamin3d.geometry.reprojection import linearize, squared_error
 from vitamin3d.geometry.se3 import inverse
-from vitamin3d.mapping.sparse_map import SparseMap
+from vitamin3d.sparse_map import SparseMap
 from vitamin3d.types import Array, PointCloud
 
 LEAST_DETERMINANT = 1e-15

@@ -10,7 +10,7 @@ from vitamin3d.geometry.camera import Camera
 from vitamin3d.geometry.se3 import inverse
 from vitamin3d.geometry.triangulation import triangulate
 from vitamin3d.mapping.landmark_statistics import add_squared_errors
-from vitamin3d.mapping.sparse_map import SparseMap
+from vitamin3d.sparse_map import SparseMap
 from vitamin3d.types import Array
 
 

@@ -7,7 +7,7 @@ import numpy as np
 
 from vitamin3d._jit import kernel
 from vitamin3d.config import MemoryConfig
-from vitamin3d.mapping.sparse_map import SparseMap
+from vitamin3d.sparse_map import SparseMap
 from vitamin3d.types import Array
 
 
@@ -45,13 +45,11 @@ def redundant_keyframes(sparse_map: SparseMap, number: int, num_recent: int) -> 
 
 @dataclass(frozen=True)
 class Condensation:
-    """A smaller map, and what became of the old one's numbers."""
+    """A smaller map, and what became of the old one's keyframes."""
 
     map: SparseMap
     kept_keyframes: Array
     """(K',) old numbers, ascending."""
-    kept_ids: Array
-    """(I',) old ids of landmarks and tracks, ascending; the new id is the position."""
 
 
 def is_due(sparse_map: SparseMap, num_new_ids: int, config: MemoryConfig) -> bool:
@@ -70,5 +68,4 @@ def condense(sparse_map: SparseMap, needed_ids: Array, num_recent: int, config: 
     number = int(np.ceil(config.dropped_share * config.max_keyframes)) if excess > 0 else 0
     dropped = redundant_keyframes(sparse_map, number, num_recent) if number else np.zeros(0, np.int64)
     kept_keyframes = np.setdiff1d(np.arange(sparse_map.num_keyframes), dropped)
-    smaller, kept_ids = sparse_map.condensed(kept_keyframes, needed_ids, config.min_observations, num_recent)
-    return Condensation(smaller, kept_keyframes, kept_ids)
+    return Condensation(sparse_map.condensed(kept_keyframes, needed_ids, config.min_observations, num_recent), kept_keyframes)

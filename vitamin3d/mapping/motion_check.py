@@ -14,7 +14,7 @@ from vitamin3d.config import MotionCheckConfig
 from vitamin3d.geometry.camera import Camera
 from vitamin3d.geometry.epipolar_refinement import best_motion, motion_cost
 from vitamin3d.geometry.se3 import inverse, rotation_angle_deg
-from vitamin3d.mapping.sparse_map import SparseMap
+from vitamin3d.sparse_map import SparseMap
 from vitamin3d.types import Array
 
 

@@ -15,8 +15,8 @@ from vitamin3d.bundle_adjustment.schur import adjust_schur
 from vitamin3d.config import CalibrationConfig
 from vitamin3d.geometry.camera import Camera
 from vitamin3d.geometry.rolling_shutter import ideal_pixels, measured_pixels
-from vitamin3d.mapping.sparse_map import SparseMap
 from vitamin3d.mapping.window_selection import Window, build_problem
+from vitamin3d.sparse_map import SparseMap
 from vitamin3d.types import Array, BundleReport
 
 STEP_IN_INTERVALS = 0.2

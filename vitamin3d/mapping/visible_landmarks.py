@@ -11,7 +11,7 @@ from scipy.spatial import cKDTree
 from vitamin3d.config import SnapshotConfig
 from vitamin3d.geometry.camera import Camera
 from vitamin3d.mapping.landmark_statistics import UnitInformation, Vertices, vertices_of
-from vitamin3d.mapping.sparse_map import SparseMap
+from vitamin3d.sparse_map import SparseMap
 from vitamin3d.types import Array
 
 

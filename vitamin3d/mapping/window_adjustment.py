@@ -9,8 +9,8 @@ import numpy as np
 
 from vitamin3d.bundle_adjustment.problem import BundleProblem
 from vitamin3d.geometry.se3 import inverse
-from vitamin3d.mapping.sparse_map import SparseMap
 from vitamin3d.mapping.window_selection import Window, store_solution
+from vitamin3d.sparse_map import SparseMap
 
 
 @dataclass(frozen=True)
@@ -52,6 +52,27 @@ class AdjustAtOnce:
     def take(self, wait: bool = False) -> WindowAdjustment | None:
         result, self._result = self._result, None
         return result
+
+
+class SharedAdjuster:
+    """The adjuster of all maps of a run: the windows are solved by one worker, which may be exchanged between two tasks."""
+
+    def __init__(self) -> None:
+        self._worker: Adjuster = AdjustAtOnce()
+
+    def work_with(self, worker: Adjuster) -> None:
+        """Windows are solved by this one from now on."""
+        self._worker = worker
+
+    @property
+    def is_busy(self) -> bool:
+        return self._worker.is_busy
+
+    def begin(self, task: Callable[[], WindowAdjustment]) -> None:
+        self._worker.begin(task)
+
+    def take(self, wait: bool = False) -> WindowAdjustment | None:
+        return self._worker.take(wait)
 
 
 def store_adjustment(sparse_map: SparseMap, done: WindowAdjustment) -> None:

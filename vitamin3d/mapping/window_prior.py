@@ -14,8 +14,8 @@ from vitamin3d.bundle_adjustment.variables import pinhole_model, squared_reproje
 from vitamin3d.config import Config
 from vitamin3d.errors import InputError
 from vitamin3d.geometry.camera import Camera
-from vitamin3d.mapping.sparse_map import SparseMap
 from vitamin3d.mapping.window_selection import Window, build_problem
+from vitamin3d.sparse_map import SparseMap
 from vitamin3d.types import Array
 
 ALIVE_KEYFRAMES = 3

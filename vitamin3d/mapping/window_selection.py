@@ -12,7 +12,7 @@ import numpy as np
 from vitamin3d._jit import kernel
 from vitamin3d.bundle_adjustment.problem import BundleProblem, order_by_point
 from vitamin3d.config import WindowConfig
-from vitamin3d.mapping.sparse_map import SparseMap
+from vitamin3d.sparse_map import SparseMap
 from vitamin3d.types import Array
 
 
@@ -112,7 +112,7 @@ def build_problem(sparse_map: SparseMap, window: Window, view: tuple[Array, Arra
     """The adjustment of a window, or of the newest frame, where it is no keyframe, and its landmarks.
 
     Args:
-        view: T_cam_world (4, 4), landmark ids (N,) and ideal pixels (N, 2) of that frame, or None.
+        view: T_cam_world (4, 4), landmark rows (N,) and ideal pixels (N, 2) of that frame, or None.
             Landmarks that it does not see are left out.
     """
     starts = np.array(sparse_map.keyframe_starts)
@@ -131,10 +131,10 @@ def build_problem(sparse_map: SparseMap, window: Window, view: tuple[Array, Arra
     is_free = np.arange(len(poses)) < window.num_adjusted
     is_free[: window.num_fixed] = False
     if view is not None:
-        T_view, view_ids, view_pixels = view
-        known = local[view_ids] >= 0
+        T_view, view_rows, view_pixels = view
+        known = local[view_rows] >= 0
         obs_camera = np.append(obs_camera, np.full(known.sum(), len(poses), np.int32))
-        obs_point = np.append(obs_point, local[view_ids[known]])
+        obs_point = np.append(obs_point, local[view_rows[known]])
         rows = np.append(rows, np.full(known.sum(), -1))
         pixels = np.concatenate([pixels, view_pixels[known]])
         poses, is_free = np.concatenate([poses, T_view[None]]), np.append(is_free, True)

@@ -12,7 +12,7 @@ import cv2
 import numpy as np
 
 from vitamin3d.config import ContinuityConfig
-from vitamin3d.tracking.corners import described_corners, mutual_matches
+from vitamin3d.image.corners import described_corners, mutual_matches
 from vitamin3d.types import Array
 
 LEAST_SHARED = 0.1

@@ -7,7 +7,7 @@ import cv2
 import numpy as np
 
 from vitamin3d.config import DominantFlowConfig
-from vitamin3d.tracking.corners import mutual_matches
+from vitamin3d.image.corners import mutual_matches
 from vitamin3d.types import Array, DominantFlow
 
 PATCH_PX = 15

@@ -7,12 +7,12 @@ import cv2
 import numpy as np
 
 from vitamin3d.config import Config
+from vitamin3d.image.curvature import curvature, curvature_of, smoothed
+from vitamin3d.image.extrema import detect_extrema
+from vitamin3d.image.noise_floor import curvature_floor, lowest_floor, noise_deviation, smoothing_for
+from vitamin3d.image.significance import is_significant, significance
 from vitamin3d.tracking.continuity import FlowTracker
-from vitamin3d.tracking.curvature import curvature, curvature_of, smoothed
 from vitamin3d.tracking.dominant_flow import CoarseFeatures, coarse_features, estimate_dominant_flow
-from vitamin3d.tracking.extrema import detect_extrema
-from vitamin3d.tracking.noise_floor import curvature_floor, lowest_floor, noise_deviation, smoothing_for
-from vitamin3d.tracking.significance import is_significant, significance
 from vitamin3d.types import Array, DominantFlow, Frame, FrontEndFrame, StepTimes
 
 DESCENT_ITERATIONS = 8

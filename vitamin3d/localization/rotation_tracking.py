@@ -13,7 +13,7 @@ from vitamin3d.config import RotationConfig
 from vitamin3d.geometry.camera import Camera
 from vitamin3d.geometry.rotation_fit import fit_rotation, turned_by
 from vitamin3d.geometry.se3 import rotation_angle_deg
-from vitamin3d.mapping.sparse_map import GrowingArray
+from vitamin3d.growing_array import GrowingArray, IdRows
 from vitamin3d.types import Array, Frame
 
 INLIER_SIGMAS = 3.0
@@ -22,26 +22,28 @@ INLIER_SIGMAS = 3.0
 class Directions:
     """By track id: the direction in the world in which a track was first seen; NaN where it is not known."""
 
-    def __init__(self) -> None:
-        self._directions = GrowingArray((3,), np.float64, np.nan)
+    def __init__(self, first_id: int = 0) -> None:
+        self._rows, self._directions = IdRows(first_id), GrowingArray((3,), np.float64, np.nan)
 
     def note(self, ids: Array, pixels: Array, R_cam_world: Array, camera: Camera) -> None:
         """Tracks (N,) ids at ideal pixels (N, 2) that have no direction get the one in which this camera sees them."""
-        self._directions.resize(int(ids.max(initial=-1)) + 1)
-        new = np.isnan(self._directions.view[ids, 0])
-        self._directions.view[ids[new]] = unit_rays(pixels[new], camera) @ R_cam_world
+        rows = self._rows.of(ids)
+        self._directions.resize(int(rows.max(initial=-1)) + 1)
+        new = (rows >= 0) & np.isnan(self._directions.view[rows, 0])
+        self._directions.view[rows[new]] = unit_rays(pixels[new], camera) @ R_cam_world
 
     def of(self, ids: Array) -> Array:
         """Unit directions (N, 3) in the world of tracks (N,) ids."""
-        out, known = np.full((len(ids), 3), np.nan), ids < self._directions.size
-        out[known] = self._directions.view[ids[known]]
+        rows = self._rows.of(ids)
+        out, known = np.full((len(ids), 3), np.nan), (rows >= 0) & (rows < self._directions.size)
+        out[known] = self._directions.view[rows[known]]
         return out
 
-    def renamed(self, kept_ids: Array) -> "Directions":
-        """With ids numbered anew: the new id is the position in `kept_ids`."""
-        renamed = Directions()
-        renamed._directions.append(self.of(kept_ids))
-        return renamed
+    def keep(self, ids: Array) -> None:
+        """Forgets all tracks but those with `ids` (N,), ascending."""
+        directions, self._rows = self.of(ids), self._rows.keeping(ids)
+        self._directions = GrowingArray((3,), np.float64, np.nan)
+        self._directions.append(directions)
 
 
 class Turns:

@@ -6,7 +6,8 @@ from collections.abc import Iterable
 import numpy as np
 
 from vitamin3d.geometry.se3 import inverse
-from vitamin3d.mapping.sparse_map import GrowingArray, SparseMap
+from vitamin3d.growing_array import GrowingArray
+from vitamin3d.sparse_map import SparseMap
 from vitamin3d.types import Array, Frame, Trajectory
 
 

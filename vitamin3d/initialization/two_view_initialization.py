@@ -12,7 +12,7 @@ from vitamin3d.config import InitializationConfig
 from vitamin3d.geometry.camera import Camera
 from vitamin3d.geometry.essential import relative_pose
 from vitamin3d.geometry.rotation_fit import fit_rotation, turned_by
-from vitamin3d.mapping.rotation_tracking import unit_rays
+from vitamin3d.localization.rotation_tracking import unit_rays
 from vitamin3d.types import Array, TwoView
 
 

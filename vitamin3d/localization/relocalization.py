@@ -13,9 +13,9 @@ from scipy.spatial import cKDTree
 
 from vitamin3d.config import LocalizationConfig, RelocalizationConfig
 from vitamin3d.geometry.camera import Camera
-from vitamin3d.mapping.p3p_localization import localize
-from vitamin3d.mapping.sparse_map import SparseMap
-from vitamin3d.tracking.corners import described_corners, mutual_matches
+from vitamin3d.image.corners import described_corners, mutual_matches
+from vitamin3d.localization.p3p_localization import localize
+from vitamin3d.sparse_map import SparseMap
 from vitamin3d.types import Array, Frame, Localization
 
 

@@ -9,7 +9,7 @@ import cv2
 import numpy as np
 
 from vitamin3d.config import ExtremaConfig
-from vitamin3d.tracking.noise_floor import QUIET_SHARE
+from vitamin3d.image.noise_floor import QUIET_SHARE
 from vitamin3d.types import Array
 
 BLOCK_PX = 16

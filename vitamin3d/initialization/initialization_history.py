@@ -1,32 +1,9 @@
 # SPDX-License-Identifier: Apache-2.0
 """The tracked frames before there is a map: which of them the newest is paired with, and why it is not yet."""
 
-from dataclasses import dataclass
-
-import numpy as np
-
 from vitamin3d.config import InitializationConfig
-from vitamin3d.mapping.two_view_initialization import median_motion
-from vitamin3d.types import Array, Frame, Tracks
-
-
-@dataclass(frozen=True)
-class TrackedView:
-    """A frame with the tracks seen in it."""
-
-    frame: Frame
-    tracks: Tracks
-    """Without those that coast."""
-    ideal_pixels: Array
-    """(N, 2) of the tracks."""
-    image_motion: Array
-    """(6, 2) of `geometry/rolling_shutter.py`."""
-
-
-def shared_tracks(a: TrackedView, b: TrackedView) -> tuple[Array, Array]:
-    """Rows (N,) in a and rows (N,) in b of the tracks that both have."""
-    _, rows_a, rows_b = np.intersect1d(a.tracks.ids, b.tracks.ids, assume_unique=True, return_indices=True)
-    return rows_a, rows_b
+from vitamin3d.initialization.two_view_initialization import median_motion
+from vitamin3d.types import Array, TrackedView, shared_tracks
 
 
 class InitializationHistory:
