@@ -22,7 +22,7 @@ CHOICES = {
     "extrema_tracking.prediction": ("dense_flow", "dominant_flow"),
     "bundle_adjustment.keyframe_solver": ("subspace-accelerated", "schur", "subspace", "subspace-inner"),
     "window.past": ("anchors", "prior"),
-    "fusion.backend": ("blocks", "scalable", "voxel_block_grid"),
+    "fusion.backend": ("blocks", "scalable"),
     "calibration.refine": ("auto", "on", "off"),
 }
 AT_LEAST_ONE = (
@@ -395,7 +395,7 @@ class BundleAdjustmentConfig:
     sigma_px: float = 2.0
     sweeps_per_frame: int = 0
     """Subspace Gauss–Newton sweeps over the newest keyframes and the frame's landmarks, at every frame (Eq. 11–12). Where frames are
-    localised by thousands of landmarks they gain little (docs/bundle_adjustment.md)."""
+    localised by thousands of landmarks they gain little."""
     keyframe_solver: str = "subspace-accelerated"
     """Solver of the window at each keyframe: `subspace-accelerated` (cameras together with the points eliminated, then each
     point alone), `schur` (the former only), `subspace` (Eq. 11–12) or `subspace-inner` (several sweeps with the same derivatives)."""
@@ -502,7 +502,7 @@ class SnapshotConfig:
     max_relative_deviation: float = 0.5
     max_reprojection_rms_px: float = 1.5
     unobserved: bool = False
-    """Landmarks that a keyframe sees without observing them too. Off: the swept pixels are there already (docs/dense.md)."""
+    """Landmarks that a keyframe sees without observing them too. Off: the swept pixels are there already."""
     occlusion_neighbours: int = 5
     """An unobserved landmark must lie between the depths of so many observed ones around it,"""
     occlusion_radius_px: float = 40.0
@@ -647,7 +647,7 @@ class ConsistencyConfig:
 class PhotometricConfig:
     """Before fusion, triangles that may be webs over free space must look alike in the pictures of the voters.
 
-    Off: after the votes it finds nothing more that is wrong (docs/dense.md).
+    Off: after the votes it finds nothing more that is wrong.
     """
 
     enabled: bool = False
@@ -669,8 +669,8 @@ class FusionConfig:
     """Sec. 4.2: the two TSDF volumes."""
 
     backend: str = "scalable"
-    """Open3D's `scalable` (ScalableTSDFVolume) or `voxel_block_grid`, where all pixels that are certain enough weigh the same; or
-    `blocks` (ours), where each weighs by its certainty."""
+    """`scalable`, Open3D's ScalableTSDFVolume, where all pixels that are certain enough weigh the same, or `blocks` (ours), where each
+    weighs by its certainty."""
     voxel_low: float | None = None
     """Metres where the scale is known, else map units; None: median depth of the scene / 20 (and / 120)."""
     voxel_high: float | None = None
@@ -685,8 +685,6 @@ class FusionConfig:
     """The surface ends where all views together leave a larger deviation of the depth (`blocks` alone)."""
     max_depth: float = 3.0
     """Depth beyond this many median depths of the scene is not fused."""
-    kept_megabytes: float = 500.0
-    """Of fused views, for colours and for steps of the surface (`scalable` alone); beyond it every second one is dropped."""
 
 
 @dataclass(frozen=True)

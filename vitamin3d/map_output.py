@@ -7,6 +7,7 @@ from contextlib import ExitStack
 from typing import Any
 
 from vitamin3d.config import Config
+from vitamin3d.dense.stages import staged
 from vitamin3d.exporters.output_folder import MapFolder
 from vitamin3d.geometry.camera import Camera
 from vitamin3d.geometry.se3 import inverse
@@ -70,7 +71,7 @@ class MapOutput:
     def fuse(self, view: DepthView) -> None:
         """Fuses a view and writes its maps."""
         with step(f"fusing the view of {view.timestamp_ns / 1e9:.3f} s"):
-            fused = self.begun().fuse(view)
+            fused = self.begun().volumes.fuse(view)
         self.note_lags(fused)
         with step("writing depth and normal maps"):
             self.folder.write_view(view, self.scale)
@@ -94,7 +95,7 @@ class MapOutput:
 
     def fuse_again(self, trajectory: Trajectory) -> None:
         """Moves the fused views of keyframes that moved afterwards."""
-        if self.reconstruction is not None and self.reconstruction.store is not None:
+        if self.reconstruction is not None and self.reconstruction.volumes.store is not None:
             poses = inverse(trajectory.T_world_cam)
             with step("fusing keyframes anew that moved"):
                 self.num_moved = self.reconstruction.fuse_again(dict(zip(trajectory.timestamps_ns.tolist(), poses, strict=True)))
@@ -108,7 +109,7 @@ class MapOutput:
             f"reprojection RMS up to {config.max_reprojection_rms_px} px"
         )
         self.folder.write_trajectories(slam.trajectory(), slam.keyframe_trajectory(), self.scale)
-        self.folder.write_calibration(slam.camera, "as given" if slam.camera == slam.calibration.given else "refined with the map")
+        self.folder.write_calibration(slam.camera, "as given" if slam.camera == slam.mapper.calibration.given else "refined with the map")
         self.folder.write_cloud(cloud, self.scale, remark)
         self.cloud_points = len(cloud.points_world)
 
@@ -118,20 +119,21 @@ class MapOutput:
         if dense is None:
             return
         if is_broken:
-            dense.forget_waiting()
-        if dense.median_depths:
-            self.empty_meshes = self.folder.write_surfaces(*dense.surfaces(), self.scale, dense.voxel_lengths(), dense.filter_remark)
+            dense.chain.clear()
+        if dense.volumes.median_depths:
+            remark = dense.volumes.filter_remark
+            self.empty_meshes = self.folder.write_surfaces(*dense.surfaces(), self.scale, dense.volumes.voxel_lengths(), remark)
 
     def voxels(self) -> dict[str, float] | None:
         """Sides of the voxels in the unit of the output."""
-        if self.reconstruction is None or not self.reconstruction.median_depths:
+        if self.reconstruction is None or not self.reconstruction.volumes.median_depths:
             return None
-        low, high = self.reconstruction.voxel_lengths()
+        low, high = self.reconstruction.volumes.voxel_lengths()
         return {"low": low * self.scale.metres_per_unit, "high": high * self.scale.metres_per_unit}
 
     def volumes(self) -> dict[str, Any] | None:
         """Blocks and megabytes of the volumes where they are known, and what was kept and moved of the views."""
-        dense = self.reconstruction
+        dense = None if self.reconstruction is None else self.reconstruction.volumes
         if dense is None or dense.low is None or dense.high is None:
             return None
         table: dict[str, Any] = {name: _megabytes(volume.size()) for name, volume in (("low", dense.low), ("high", dense.high))}
@@ -173,9 +175,12 @@ class MapOutputs:
         """All keyframes that come; densified ahead of meshing, meshed ahead of the fusion."""
         with ExitStack() as threads:
             waited_for = snapshots if isinstance(snapshots, Items) else None
-            densified = self._beside(threads, "densification", self._densified(snapshots), waited_for)
-            views = self._beside(threads, "meshing", self._views(densified), densified if isinstance(densified, ReadAhead) else None)
-            for output, view in views:
+            densified = staged(snapshots, lambda number: self.of(number).begun().densifying)
+            ready = self._beside(threads, "densification", densified, waited_for)
+            views = staged(ready, lambda number: self.of(number).begun().meshing)
+            meshed = self._beside(threads, "meshing", views, ready if isinstance(ready, ReadAhead) else None)
+            for view in (view for view in meshed if isinstance(view, DepthView)):
+                output = self.of(view.map_number)
                 output.fuse(view)
                 if done is not None:
                     done(output, view)
@@ -192,39 +197,6 @@ class MapOutputs:
             return source
         size, niceness = (1, DENSE_NICENESS) if self._is_live else (READ_AHEAD, 0)
         return threads.enter_context(ReadAhead(source, name, size, niceness, upstream))
-
-    def _densified(self, snapshots: Iterable[Message]) -> Iterator[Message]:
-        newest: Reconstruction | None = None
-        for snapshot in snapshots:
-            if isinstance(snapshot, MapSnapshot):
-                here = self.of(snapshot.map_number).begun()
-                if newest is not None and newest is not here:
-                    yield from newest.last_densified()
-                newest = here
-                yield from here.densified_ready(snapshot)
-            elif newest is not None:
-                yield from newest.late_densified(snapshot.timestamp_ns)
-                yield snapshot
-        if newest is not None:
-            yield from newest.last_densified()
-
-    def _views(self, snapshots: Iterable[Message]) -> Iterator[tuple[MapOutput, DepthView]]:
-        newest: MapOutput | None = None
-        for snapshot in snapshots:
-            if isinstance(snapshot, MapSnapshot):
-                here = self.of(snapshot.map_number)
-                if newest is not None and newest is not here:
-                    yield from _of(newest, newest.begun().last_drawn())
-                newest = here
-                yield from _of(here, here.begun().drawn_ready(snapshot))
-            elif newest is not None:
-                yield from _of(newest, newest.begun().late_drawn(snapshot.timestamp_ns))
-        if newest is not None:
-            yield from _of(newest, newest.begun().last_drawn())
-
-
-def _of(output: MapOutput, views: Iterator[DepthView]) -> Iterator[tuple[MapOutput, DepthView]]:
-    return ((output, view) for view in views)
 
 
 def _named(name: str, source: Iterator[Any]) -> Iterator[Any]:

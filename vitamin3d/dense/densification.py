@@ -15,8 +15,8 @@ import numpy as np
 from vitamin3d._jit import inlined, kernel
 from vitamin3d._lanes import WIDE, load_singles, singles, store, total_single
 from vitamin3d.config import DensificationConfig
-from vitamin3d.dense.neighbour_queue import Around
 from vitamin3d.dense.plane_sweep import PlaneSweep, SweptDepth, turned
+from vitamin3d.dense.view_graph import Neighbourhood
 from vitamin3d.geometry.camera import Camera
 from vitamin3d.geometry.se3 import inverse
 from vitamin3d.types import Array, Frame, MapSnapshot
@@ -185,7 +185,7 @@ class Densifier:
         self.reduced = replace(canvas.scaled(1 / REDUCTION), width=canvas.width // REDUCTION, height=canvas.height // REDUCTION)
         self._sweep: PlaneSweep | None = None
 
-    def densify(self, around: Around[CanvasPicture]) -> MapSnapshot:
+    def densify(self, around: Neighbourhood[CanvasPicture]) -> MapSnapshot:
         """The snapshot with more vertices, or as it was where it has few landmarks or too few neighbours with parallax."""
         picture, snapshot = around.item, around.item.snapshot
         if len(snapshot.depths) < self.config.min_landmarks:

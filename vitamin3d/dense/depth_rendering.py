@@ -36,7 +36,8 @@ class DepthRenderer:
         drawn[self.is_outside, 0] = 0.0
         depth, normals = depth_and_normals(drawn[..., :3], self.canvas)
         weights = inverse_variances(depth, drawn[..., 3])
-        return DepthView(snapshot.frame.timestamp_ns, snapshot.T_cam_world, depth, normals, self._draw_color(snapshot.frame), weights)
+        color, at = self._draw_color(snapshot.frame), (snapshot.frame.timestamp_ns, snapshot.T_cam_world)
+        return DepthView(*at, depth, normals, color, weights, map_number=snapshot.map_number)
 
     def _draw_color(self, frame: Frame) -> Array:
         image = frame.image if frame.color is None else frame.color

@@ -9,14 +9,12 @@ import numpy as np
 
 from vitamin3d._jit import kernel
 from vitamin3d.dense.block_volume import BlockVolume
-from vitamin3d.dense.fused_views import FusedViews
-from vitamin3d.dense.voxel_cloud import surface_of
 from vitamin3d.errors import DependencyError, InputError
 from vitamin3d.geometry.camera import Camera
 from vitamin3d.types import Array, DepthView, Surface
 
 BLOCK_RESOLUTION = 16
-"""Voxels along the side of a block; all backends allocate by blocks."""
+"""Voxels along the side of a block of Open3D's volume."""
 ALLOCATION_STRIDE = 8
 """Open3D's volume allocates for every so many-th pixel in both directions; a fine block is some hundred of them wide."""
 
@@ -26,7 +24,7 @@ class Limits:
     """What is too uncertain to be fused."""
 
     relative_deviation: float
-    """Of a pixel's depth over the depth; beyond it Open3D's volumes, which know no weights, do not get the pixel."""
+    """Of a pixel's depth over the depth; beyond it Open3D's volume, which knows no weights, does not get the pixel."""
     surface_deviation: float
     """Map units; the surface of `blocks` ends where all views together know it worse than this."""
 
@@ -38,25 +36,20 @@ class TsdfVolume:
         voxel_length: map units.
         truncation: map units; distances are kept up to this far from a surface.
         limits: what is too uncertain to be fused.
-        backend: `scalable` (Open3D's ScalableTSDFVolume), `voxel_block_grid` (its tensor twin) or `blocks` (ours; every pixel
-            has its weight, in the others all weigh the same).
-        views: for `scalable`: what is integrated is kept there too, by the caller. The surface is then had from both, in less
-            time, and the volume has no colours of its own.
+        backend: `scalable` (Open3D's ScalableTSDFVolume, in which all pixels weigh the same) or `blocks` (ours; every pixel has its
+            weight, and views can be taken out again).
 
     Raises:
         InputError: no such backend.
         DependencyError: the installed Open3D fuses nothing.
     """
 
-    def __init__(
-        self, voxel_length: float, truncation: float, limits: Limits, backend: str = "scalable", views: FusedViews | None = None
-    ) -> None:
+    def __init__(self, voxel_length: float, truncation: float, limits: Limits, backend: str = "scalable") -> None:
         if backend not in BACKENDS:
             raise InputError(f"fusion.backend must be one of {', '.join(BACKENDS)}, not {backend!r}")
         check_backend(backend)
         self.voxel_length = voxel_length
-        sides = (voxel_length, truncation, limits)
-        self._volume: _Backend = BACKENDS[backend](*sides) if views is None else _ScalableVolume(*sides, views)
+        self._volume: _Backend = BACKENDS[backend](voxel_length, truncation, limits)
 
     def integrate(self, view: DepthView, canvas: Camera, max_depth: float) -> None:
         """Averages a view, drawn on `canvas`, into the volume; depths beyond `max_depth` (map units) are left out."""
@@ -98,17 +91,16 @@ class _Backend(Protocol):
 
 
 class _ScalableVolume:
-    """Open3D's ScalableTSDFVolume; with views that are kept beside it its surface and the colours come from them too."""
+    """Open3D's ScalableTSDFVolume, with its own marching cubes."""
 
-    def __init__(self, voxel_length: float, truncation: float, limits: Limits, views: FusedViews | None = None) -> None:
+    def __init__(self, voxel_length: float, truncation: float, limits: Limits) -> None:
         import open3d as o3d
 
-        self._voxel_length, self._truncation, self._limits, self._views = voxel_length, truncation, limits, views
-        colors = o3d.pipelines.integration.TSDFVolumeColorType
+        self._limits = limits
         self._volume = o3d.pipelines.integration.ScalableTSDFVolume(
             voxel_length=voxel_length,
             sdf_trunc=truncation,
-            color_type=colors.RGB8 if views is None else colors.NoColor,
+            color_type=o3d.pipelines.integration.TSDFVolumeColorType.RGB8,
             volume_unit_resolution=BLOCK_RESOLUTION,
             depth_sampling_stride=ALLOCATION_STRIDE,
         )
@@ -117,8 +109,7 @@ class _ScalableVolume:
         import open3d as o3d
 
         rgbd = o3d.geometry.RGBDImage()
-        if self._views is None:
-            rgbd.color = o3d.geometry.Image(np.ascontiguousarray(view.color))
+        rgbd.color = o3d.geometry.Image(np.ascontiguousarray(view.color))
         rgbd.depth = o3d.geometry.Image(certain_depth(view, self._limits.relative_deviation, max_depth))
         pinhole = o3d.camera.PinholeCameraIntrinsic(canvas.width, canvas.height, canvas.fx, canvas.fy, canvas.cx, canvas.cy)
         self._volume.integrate(rgbd, pinhole, view.T_cam_world)
@@ -127,50 +118,8 @@ class _ScalableVolume:
         return None
 
     def extract_surface(self) -> Surface:
-        if self._views is not None:
-            return surface_of(self._volume, self._voxel_length, self._truncation, self._views)
         mesh = self._volume.extract_triangle_mesh()
         return _surface(np.asarray(mesh.vertices), np.asarray(mesh.triangles), np.asarray(mesh.vertex_colors))
-
-
-class _VoxelBlockGrid:
-    """Open3D's tensor VoxelBlockGrid on the CPU (its `ray_cast` crashes at random and is never called)."""
-
-    def __init__(self, voxel_length: float, truncation: float, limits: Limits) -> None:
-        import open3d as o3d
-
-        self._truncation_voxels, self._limits = truncation / voxel_length, limits
-        self._grid = o3d.t.geometry.VoxelBlockGrid(
-            attr_names=("tsdf", "weight", "color"),
-            attr_dtypes=(o3d.core.float32, o3d.core.float32, o3d.core.float32),
-            attr_channels=((1), (1), (3)),
-            voxel_size=voxel_length,
-            block_resolution=BLOCK_RESOLUTION,
-            block_count=4000,
-            device=o3d.core.Device("CPU:0"),
-        )
-
-    def integrate(self, view: DepthView, canvas: Camera, max_depth: float) -> None:
-        import open3d as o3d
-
-        depth = o3d.t.geometry.Image(o3d.core.Tensor(certain_depth(view, self._limits.relative_deviation, max_depth)))
-        color = o3d.t.geometry.Image(o3d.core.Tensor(view.color.astype(np.float32) / 255.0))
-        K, T = o3d.core.Tensor(canvas.K), o3d.core.Tensor(np.ascontiguousarray(view.T_cam_world, np.float64))
-        scales = (1.0, max_depth, self._truncation_voxels)
-        blocks = self._grid.compute_unique_block_coordinates(depth, K, T, *scales)
-        self._grid.integrate(blocks, depth, color, K, K, T, *scales)
-
-    def size(self) -> dict[str, int] | None:
-        blocks, bytes_per_voxel = int(self._grid.hashmap().size()), 4 * (1 + 1 + 3)
-        return {"blocks": blocks, "bytes": bytes_per_voxel * BLOCK_RESOLUTION**3 * int(self._grid.hashmap().capacity())}
-
-    def extract_surface(self) -> Surface:
-        if self._grid.hashmap().size() == 0:
-            return empty_surface()
-        mesh = self._grid.extract_triangle_mesh(weight_threshold=0.5)
-        if "positions" not in mesh.vertex or not len(mesh.vertex.positions):
-            return empty_surface()
-        return _surface(mesh.vertex.positions.numpy(), mesh.triangle.indices.numpy(), mesh.vertex.colors.numpy())
 
 
 class _WeightedBlocks:
@@ -192,7 +141,7 @@ class _WeightedBlocks:
         return _surface(*self._volume.extract())
 
 
-BACKENDS: dict[str, type[_Backend]] = {"scalable": _ScalableVolume, "voxel_block_grid": _VoxelBlockGrid, "blocks": _WeightedBlocks}
+BACKENDS: dict[str, type[_Backend]] = {"scalable": _ScalableVolume, "blocks": _WeightedBlocks}
 
 
 def certain_depth(view: DepthView, max_relative_deviation: float, max_depth: float) -> Array:
