@@ -122,7 +122,7 @@ def run(trial: Trial, config: Config) -> Score:
         localised=success_rate(num_localised(atlas), len(trial.indices)),
         live_tracks=median_of(record.live_tracks),
         keyframes=slam.map.num_keyframes,
-        landmarks=int(np.isfinite(slam.map.points_world[:, 0]).sum()),
+        landmarks=len(slam.map.landmarks),
         milliseconds=1e3 * seconds / len(trial.indices),
         tracks=track_scores(record, trial) if trial.score_tracks else (),
     )

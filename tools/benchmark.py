@@ -188,7 +188,7 @@ def benchmark(dataset: Dataset, frames: int | None, config: Config) -> dict[str,
         "frames": count,
         "processed_frames": len(made.live_points),
         "keyframes": made.slam.map.num_keyframes,
-        "landmarks": int(np.isfinite(made.slam.map.points_world[:, 0]).sum()),
+        "landmarks": len(made.slam.map.landmarks),
         "live_points": float(np.median(made.live_points)),
         "voxels": [scale.metres_per_unit * length for length in reconstruction.volumes.voxel_lengths()],
         "unit": scale.unit if scale.is_known else "map unit",
@@ -254,7 +254,7 @@ def loop(dataset: Dataset, frames: int, config: Config, with_dense: bool = False
         for keyframe, frame in settled if with_dense else []:
             reconstruction.add_keyframe(slam.snapshot(keyframe, frame))
         if done % MEMORY_INTERVAL == 0 or done == frames:
-            landmarks = int(np.isfinite(slam.map.points_world[:, 0]).sum())
+            landmarks = len(slam.map.landmarks)
             course.append(
                 {
                     "frames": done,

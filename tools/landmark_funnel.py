@@ -94,9 +94,9 @@ class FunnelTracker(Tracker):
         self._known = self.tracks.ids
         return motion
 
-    def _climbed(self, predicted: Array, front: FrontEndFrame) -> Tracks:
+    def climb(self, predicted: Array, front: FrontEndFrame) -> Tracks:
         self._followed = self.tracks
-        return super()._climbed(predicted, front)
+        return super().climb(predicted, front)
 
     def refill(self, front: FrontEndFrame) -> None:
         super().refill(front)
@@ -160,7 +160,7 @@ def stages(funnel: Funnel) -> dict[str, int]:
     """How many tracks reached each stage; every stage is a part of the one before, from `landmark at the end` on."""
     slam = funnel.slam
     statistics = landmark_statistics(slam.map, slam.camera)
-    ids = np.flatnonzero(~np.isnan(slam.map.points_world[:, 0]))
+    ids = slam.map.landmarks
     keyframes, parallax = statistics.num_observations[ids] >= 3, statistics.parallax_deg[ids]
     information = landmark_information(slam.map, ids, slam.camera, slam.config.snapshot)
     last = slam.map.T_cam_world[slam.map.keyframe_of(slam.map.last_observation[ids])]

@@ -26,7 +26,9 @@ if TYPE_CHECKING:
     from vitamin3d.runtime import SilentObserver, run_sequential, run_threaded
     from vitamin3d.scale import Scale
     from vitamin3d.slam import Slam
+    from vitamin3d.slam_steps import SlamSteps
     from vitamin3d.tracking.front_end import FrontEnd
+    from vitamin3d.tracking.tracker import Tracker
     from vitamin3d.types import Frame, SlamState, Surface, Trajectory
 
 _HOMES = {
@@ -48,7 +50,9 @@ _HOMES = {
     "runtime": ("SilentObserver", "run_sequential", "run_threaded"),
     "scale": ("Scale",),
     "slam": ("Slam",),
+    "slam_steps": ("SlamSteps",),
     "tracking.front_end": ("FrontEnd",),
+    "tracking.tracker": ("Tracker",),
     "types": ("Frame", "SlamState", "Surface", "Trajectory"),
 }
 _MODULES = {name: module for module, names in _HOMES.items() for name in names}
@@ -68,7 +72,9 @@ __all__ = [
     "SilentObserver",
     "Slam",
     "SlamState",
+    "SlamSteps",
     "Surface",
+    "Tracker",
     "Trajectory",
     "TruthRequest",
     "Unreadable",

@@ -1,13 +1,14 @@
 # SPDX-License-Identifier: Apache-2.0
 """The dense half of VITAMIN-E (Sec. 4.2): keyframes with landmark depths -> meshes in the image -> TSDF -> surface."""
 
-from collections.abc import Iterable, Iterator, Mapping
+from collections.abc import Callable, Iterable, Iterator, Mapping
 
 from vitamin3d.config import Config
 from vitamin3d.dense.depth_rendering import DepthRenderer
-from vitamin3d.dense.stages import Chain, Checking, Densifying, Meshing, Stage
+from vitamin3d.dense.stages import Chain, Checking, Densifying, Meshing
 from vitamin3d.dense.volumes import Volumes
 from vitamin3d.geometry.camera import Camera
+from vitamin3d.steps import Mesher, Stage, Volume
 from vitamin3d.types import Array, DepthView, MapSnapshot, StepTimes, Surface
 
 
@@ -20,11 +21,14 @@ class Reconstruction:
         times: grows by the milliseconds of each step.
         keeps_views: fused views are kept, so that `fuse_again` can move them; where the settings and the volume allow it.
         num_keyframes: that will come, all of a finished map; 0: they come while the camera is tracked.
+        mesher: another than Delaunay's triangulation with NLTGV.
+        make_volume: of voxels of this side in map units, another than the settings name.
     """
 
     def __init__(
-        self, camera: Camera, config: Config, times: StepTimes | None = None, keeps_views: bool = False, num_keyframes: int = 0
-    ) -> None:
+        self, camera: Camera, config: Config, times: StepTimes | None = None, keeps_views: bool = False, num_keyframes: int = 0,
+        mesher: Mesher | None = None, make_volume: Callable[[float], Volume] | None = None,
+    ) -> None:  # fmt: skip
         self.times = times if times is not None else StepTimes()
         self.renderer = DepthRenderer(camera, config.depth_rendering)
         steps = self.renderer, config, self.times
@@ -32,9 +36,9 @@ class Reconstruction:
         self.densifying: Stage[MapSnapshot, MapSnapshot] = Chain(
             *[Densifying(camera, *steps, num_keyframes)] if config.densification.enabled else []
         )
-        self.meshing: Stage[MapSnapshot, DepthView] = Chain(Meshing(camera, *steps), *[Checking(*steps)] if is_checked else [])
+        self.meshing: Stage[MapSnapshot, DepthView] = Chain(mesher or Meshing(camera, *steps), *[Checking(*steps)] if is_checked else [])
         self.chain: Stage[MapSnapshot, DepthView] = Chain(self.densifying, self.meshing)
-        self.volumes = Volumes(self.renderer.canvas, config, self.times, keeps_views)
+        self.volumes = Volumes(self.renderer.canvas, config, self.times, keeps_views, make_volume)
 
     @property
     def canvas(self) -> Camera:

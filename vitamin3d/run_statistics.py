@@ -128,7 +128,7 @@ def map_table(slam: Slam, rank: int, output: MapOutput) -> dict[str, Any]:
 
 
 def _num_landmarks(slam: Slam) -> int:
-    return int(np.isfinite(slam.map.points_world[:, 0]).sum())
+    return len(slam.map.landmarks)
 
 
 def _scale_table(scale: Scale) -> dict[str, Any]:

@@ -102,6 +102,11 @@ class SparseMap:
         return self._points.view
 
     @property
+    def landmarks(self) -> Array:
+        """(N,) rows of those that are landmarks, ascending."""
+        return np.flatnonzero(~np.isnan(self.points_world[:, 0]))
+
+    @property
     def num_observations(self) -> Array:
         """(L,) int32 by row: valid observations in keyframes; a view."""
         return self._count.view

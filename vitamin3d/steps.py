@@ -1,18 +1,32 @@
 # SPDX-License-Identifier: Apache-2.0
 """The steps that can be exchanged: what `Slam` and `Reconstruction` ask of each.
 
-A step of your own is a class with these methods; `Steps(tracker=MyTracker)` gives it to `Slam`, see `pipelines/own_step.py`.
+A step of your own is a class with these methods. `SlamSteps(tracker=MyTracker)` gives it to `Atlas` or `Slam`, see `pipelines/own_step.py`;
+`Reconstruction(…, mesher=MyMesher(…), make_volume=MyVolume)` to the dense half. A front end of your own only has to make the
+`FrontEndFrame`s that `process_frame` takes.
 """
 
-from collections.abc import Sequence
-from typing import Protocol
+from collections.abc import Iterator, Sequence
+from typing import Protocol, TypeVar
 
 from vitamin3d.bundle_adjustment.marginalization import CameraPrior
 from vitamin3d.bundle_adjustment.problem import BundleProblem
 from vitamin3d.config import BundleAdjustmentConfig
 from vitamin3d.geometry.camera import Camera
 from vitamin3d.sparse_map import SparseMap
-from vitamin3d.types import Array, BundleReport, Frame, FrontEndFrame, SlamState, TrackedView, Tracks
+from vitamin3d.types import (
+    Array,
+    BundleReport,
+    DepthView,
+    Frame,
+    FrontEndFrame,
+    MapSnapshot,
+    SlamState,
+    StepTimes,
+    Surface,
+    TrackedView,
+    Tracks,
+)  # fmt: skip
 
 
 class LandmarkTracker(Protocol):
@@ -136,4 +150,64 @@ class LandmarkMapper(Protocol):
 
     def recover(self, front: FrontEndFrame, T_cam_world: Array, gate_px: float | None = None) -> int:
         """Takes up landmarks that came back into view; how many."""
+        ...
+
+
+class PixelFrontEnd(Protocol):
+    """What needs pixels only, ahead of the map; `vitamin3d.tracking.front_end.FrontEnd`."""
+
+    times: StepTimes
+
+    def process(self, frame: Frame) -> FrontEndFrame:
+        """Curvature, its extrema, and the flow from the picture that this one continues."""
+        ...
+
+
+In = TypeVar("In", contravariant=True)
+Out = TypeVar("Out", covariant=True)
+
+
+class Stage(Protocol[In, Out]):
+    """One step of the dense half's chain; what goes in comes out later, or not at all."""
+
+    def push(self, item: In) -> Iterator[Out]:
+        """Takes an item, in the order of time; those that are ready."""
+        ...
+
+    def expire(self, now_ns: int) -> Iterator[Out]:
+        """What has waited too long by this time of the recording."""
+        ...
+
+    def flush(self) -> Iterator[Out]:
+        """What still waits: nothing will follow."""
+        ...
+
+    def clear(self) -> None:
+        """Drops what waits."""
+        ...
+
+
+Mesher = Stage[MapSnapshot, DepthView]
+"""A keyframe with the depths of its landmarks -> depth and normals of its picture; `vitamin3d.dense.stages.Meshing`."""
+
+
+class Volume(Protocol):
+    """What depth views are averaged into; `vitamin3d.dense.tsdf_fusion.TsdfVolume`."""
+
+    voxel_length: float
+
+    def integrate(self, view: DepthView, canvas: Camera, max_depth: float) -> None:
+        """Averages a view, drawn on `canvas`, in; depths beyond `max_depth` (map units) are left out."""
+        ...
+
+    def remove(self, view: DepthView, canvas: Camera, max_depth: float) -> None:
+        """Takes a view out that was integrated just so. InputError: it cannot."""
+        ...
+
+    def size(self) -> dict[str, int] | None:
+        """Blocks in use and bytes of them all; None where it does not know."""
+        ...
+
+    def extract_surface(self) -> Surface:
+        """The surface, without vertex normals (zero)."""
         ...

@@ -2,11 +2,11 @@
 """The dense half as a chain of stages (Sec. 4.2): densify, mesh and check. Each has three verbs and does not know the others.
 
 What goes in comes out later, or not at all: a stage may wait for neighbours. `push` takes one item, in the order of time; `expire`
-says how late it is; `flush` says that no more will follow. Each gives those that are ready.
+says how late it is; `flush` says that no more will follow. Each gives those that are ready (`Stage` in `steps.py`).
 """
 
 from collections.abc import Callable, Iterable, Iterator
-from typing import Any, Generic, Protocol, TypeVar
+from typing import Any, Generic, TypeVar
 
 from vitamin3d.config import Config
 from vitamin3d.dense.consistency import voted
@@ -19,30 +19,11 @@ from vitamin3d.dense.photometric_check import marked, photometrically_checked
 from vitamin3d.dense.view_graph import Neighbourhood, ViewGraph
 from vitamin3d.dense.view_selection import ViewSelection, view_stride
 from vitamin3d.geometry.camera import Camera
+from vitamin3d.steps import Stage
 from vitamin3d.types import DepthView, MapSnapshot, NewestFrame, StepTimes
 
 In = TypeVar("In", contravariant=True)
 Out = TypeVar("Out", covariant=True)
-
-
-class Stage(Protocol[In, Out]):
-    """One step of the chain."""
-
-    def push(self, item: In) -> Iterator[Out]:
-        """Takes an item, in the order of time."""
-        ...
-
-    def expire(self, now_ns: int) -> Iterator[Out]:
-        """What has waited too long by this time of the recording."""
-        ...
-
-    def flush(self) -> Iterator[Out]:
-        """What still waits: nothing will follow."""
-        ...
-
-    def clear(self) -> None:
-        """Drops what waits."""
-        ...
 
 
 class Densifying:

@@ -2,7 +2,7 @@
 """The coarse and the fine volume of one map (Sec. 4.2): views go in, may be moved, and two surfaces come out."""
 
 import dataclasses
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 
 import numpy as np
 
@@ -12,6 +12,7 @@ from vitamin3d.dense.tsdf_fusion import Limits, TsdfVolume, empty_surface
 from vitamin3d.dense.view_store import Packed, ViewStore, packed
 from vitamin3d.geometry.camera import Camera
 from vitamin3d.geometry.se3 import inverse
+from vitamin3d.steps import Volume
 from vitamin3d.types import Array, DepthView, StepTimes, Surface
 
 NO_NORMALS = np.zeros((0, 0, 3), np.float32)
@@ -24,12 +25,17 @@ class Volumes:
     Args:
         canvas: camera of the views.
         keeps_views: fused views are kept, so that `fuse_again` can move them; where the settings and the volume allow it.
+        make_volume: of voxels of this side in map units; None: as the settings name it.
     """
 
-    def __init__(self, canvas: Camera, config: Config, times: StepTimes, keeps_views: bool = False) -> None:
+    def __init__(
+        self, canvas: Camera, config: Config, times: StepTimes, keeps_views: bool = False,
+        make_volume: Callable[[float], Volume] | None = None,
+    ) -> None:  # fmt: skip
         self.canvas, self.config, self.times = canvas, config, times
-        self.low: TsdfVolume | None = None
-        self.high: TsdfVolume | None = None
+        self._make_volume = make_volume or self._tsdf_volume
+        self.low: Volume | None = None
+        self.high: Volume | None = None
         self.median_depths: list[float] = []
         """Of each view so far."""
         self._waiting: list[DepthView] = []
@@ -59,7 +65,7 @@ class Volumes:
 
     def _fuse(self, view: DepthView) -> None:
         if self.low is None or self.high is None:
-            self.low, self.high = (self._volume(length) for length in self.voxel_lengths())
+            self.low, self.high = (self._make_volume(length) for length in self.voxel_lengths())
         max_depth = self.config.fusion.max_depth * float(np.nanmedian(self.median_depths))
         if self.store is not None:
             with self.times.timed("keeping_views"):
@@ -71,7 +77,7 @@ class Volumes:
         with self.times.timed("fusion_high"):
             self.high.integrate(view, self.canvas, max_depth)
 
-    def _volume(self, voxel_length: float) -> TsdfVolume:
+    def _tsdf_volume(self, voxel_length: float) -> Volume:
         fusion = self.config.fusion
         limits = Limits(fusion.max_relative_deviation, fusion.max_deviation_voxels * voxel_length)
         return TsdfVolume(voxel_length, fusion.truncation_voxels * voxel_length, limits, fusion.backend)
@@ -118,7 +124,7 @@ class Volumes:
             high = self._surface(self.high)
         return low, high
 
-    def _surface(self, volume: TsdfVolume | None) -> Surface:
+    def _surface(self, volume: Volume | None) -> Surface:
         if volume is None or self.high is None:
             return empty_surface()
         coarser = volume.voxel_length / self.high.voxel_length

@@ -79,5 +79,5 @@ def _adjust_all(sparse_map: SparseMap, camera: Camera, config: Config) -> bool:
         is_outlier = squared_reprojection_errors(solved, camera) > config.bundle_adjustment.outlier_px**2
         sparse_map.remove_observations(solved.obs_rows[is_outlier])
         rmse = report.rmse_px
-    enough = np.isfinite(sparse_map.points_world[:, 0]).sum() >= config.initialization.min_tracks
+    enough = len(sparse_map.landmarks) >= config.initialization.min_tracks
     return bool(enough and rmse < MAX_RMSE_PX and np.isfinite(sparse_map.T_cam_world).all())

@@ -75,10 +75,10 @@ class Tracker:
             predicted = predict_by_dominant_flow(self.tracks.pixels, front.dominant_flow)
         before = self._measure_motion(front.frame.timestamp_ns, predicted) if measures_motion else None
         self.image_motion = self.image_motion if measures_motion else NO_MOTION
-        self.tracks = self._climbed(predicted, front)
+        self.tracks = self.climb(predicted, front)
         return before
 
-    def _climbed(self, predicted: Array, front: FrontEndFrame) -> Tracks:
+    def climb(self, predicted: Array, front: FrontEndFrame) -> Tracks:
         """The tracks at the maxima near where they are predicted (N, 2)."""
         return track_extrema(self.tracks, predicted, front.kappa, self.config.extrema_tracking)
 
