@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-# Two commands on a fresh machine: `make demo` and `make test`.
+# Two commands on a fresh machine: `make demo` and `make test`; while editing: `make test-fast`.
 VENV   ?= .venv
 PYTHON ?= $(shell for p in python3.12 python3.11 python3.10 python3; do \
             $$p -c 'import sys, venv, ensurepip; sys.exit(not (3, 10) <= sys.version_info[:2] < (3, 13))' 2>/dev/null && echo $$p && break; done)
@@ -8,7 +8,7 @@ PINS    = .ci/requirements.txt
 export OMP_NUM_THREADS ?= 1
 export OMP_WAIT_POLICY ?= passive
 
-.PHONY: demo test lint install clean
+.PHONY: demo test test-fast lint docs install clean
 
 demo: $(VENV)/.installed
 	$(VENV)/bin/vitamin3d reconstruct data/demo --out $(OUT) --overwrite --scale-from-ground-truth
@@ -16,9 +16,15 @@ demo: $(VENV)/.installed
 test: $(VENV)/.installed-dev
 	$(VENV)/bin/python -m pytest
 
+test-fast: $(VENV)/.installed-dev
+	$(VENV)/bin/python -m pytest -q --ignore=tests/regression -m "not slow"
+
 lint: $(VENV)/.installed-dev
 	$(VENV)/bin/ruff check .
 	$(VENV)/bin/mypy
+
+docs: $(VENV)/.installed-docs
+	$(VENV)/bin/mkdocs build --strict
 
 install: $(VENV)/.installed
 
@@ -34,6 +40,11 @@ $(VENV)/.installed: pyproject.toml $(PINS) | $(VENV)/bin/python
 $(VENV)/.installed-dev: pyproject.toml $(PINS) | $(VENV)/bin/python
 	@tools/system_libraries.sh
 	$(VENV)/bin/python -m pip install --quiet --disable-pip-version-check --constraint $(PINS) --editable '.[dev,eval,cluster]'
+	@touch $@ $(VENV)/.installed
+
+$(VENV)/.installed-docs: pyproject.toml $(PINS) | $(VENV)/bin/python
+	@tools/system_libraries.sh
+	$(VENV)/bin/python -m pip install --quiet --disable-pip-version-check --constraint $(PINS) --editable '.[docs]'
 	@touch $@ $(VENV)/.installed
 
 clean:

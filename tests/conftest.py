@@ -1,8 +1,10 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What all tests share; its presence also puts this folder on the path (`reference`, `reference_dense`, `scenes`)."""
+"""What all tests share."""
 
 import os
+import signal
 import sys
+import threading
 from pathlib import Path
 
 import cv2
@@ -13,6 +15,7 @@ from hypothesis import settings
 
 TESTS = Path(__file__).parent
 PACKAGE = TESTS.parent / "vitamin3d"
+LIMIT_SECONDS = 90
 
 settings.register_profile("vitamin3d", max_examples=40, deadline=None, derandomize=True, database=None)
 settings.load_profile("vitamin3d")
@@ -48,6 +51,32 @@ def demo():
     from vitamin3d.datasets import open_dataset
 
     return open_dataset(scenes.DEMO)
+
+
+@pytest.fixture(scope="session")
+def finished_benchmark(tmp_path_factory):
+    """A benchmark of one short sequence, two trials."""
+    from vitamin3d.benchmark.trial import SequenceJob, run_sequence
+
+    folder = tmp_path_factory.mktemp("benchmark")
+    source, out = scenes.demo_copy(folder / "root" / "V1_01_easy"), folder / "out" / "V1_01_easy"
+    job = SequenceJob("V1_01_easy", str(source), str(out), 2, scenes.SHORT_RUN)
+    return job, run_sequence(job)
+
+
+@pytest.fixture
+def time_limit():
+    """Whatever waits for ever is woken up, and fails."""
+
+    def too_late(*_):
+        raise TimeoutError(f"not done within {LIMIT_SECONDS} s")
+
+    handler = signal.signal(signal.SIGALRM, too_late)
+    signal.alarm(LIMIT_SECONDS)
+    yield
+    signal.alarm(0)
+    signal.signal(signal.SIGALRM, handler)
+    assert [thread for thread in threading.enumerate() if thread.name.startswith("vitamin3d")] == []
 
 
 class Told:

@@ -2,6 +2,7 @@
 """Small synthetic scenes whose truth is known."""
 
 import dataclasses
+import shutil
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -10,10 +11,15 @@ import numpy as np
 
 from vitamin3d.bundle_adjustment.problem import BundleProblem
 from vitamin3d.geometry.camera import Camera
-from vitamin3d.geometry.se3 import exp_se3
-from vitamin3d.mapping.sparse_map import SparseMap
+from vitamin3d.geometry.rolling_shutter import NO_MOTION
+from vitamin3d.geometry.se3 import exp_se3, log_so3
+from vitamin3d.initialization.initialization_history import TrackedView
+from vitamin3d.sparse_map import SparseMap
+from vitamin3d.types import Frame, Tracks
 
 DEMO = Path(__file__).parents[1] / "data" / "demo"
+SHORT_RUN = ("--max-frames", "45")
+"""Options of the benchmark's trials in tests."""
 PINHOLE = Camera(520.0, 510.0, 321.5, 239.0, 640, 480)
 EUROC = Camera(458.654, 457.296, 367.215, 248.375, 752, 480, (-0.28340811, 0.07395907, 0.00019359, 1.76187114e-05))
 
@@ -46,6 +52,11 @@ def two_views(T_1_0, rng, count=300, sigma_px=0.3):
 def direction_error_deg(a, b):
     """Between two vectors."""
     return np.degrees(np.arccos(np.clip(a @ b / np.linalg.norm(a) / np.linalg.norm(b), -1, 1)))
+
+
+def rotation_error_deg(a, b):
+    """Between two poses."""
+    return np.degrees(np.linalg.norm(log_so3(a[:3, :3].T @ b[:3, :3])))
 
 
 def arc_poses(count):
@@ -109,6 +120,17 @@ def perturbed(scene, rng, pose=0.02, point=0.05):
     return np.array(poses), scene.points + point * rng.standard_normal(scene.points.shape)
 
 
+def three_cameras(num_fixed, seed=2):
+    """Three cameras, fourteen points (the first seen once), perturbed."""
+    rng = np.random.default_rng(seed)
+    scene = arc_scene(3, 14, rng)
+    keep = (scene.obs_point != 0) | (scene.obs_camera == 1)
+    pixels = scene.pixels[keep] + rng.normal(0, 1, (keep.sum(), 2))
+    scene = dataclasses.replace(scene, obs_camera=scene.obs_camera[keep], obs_point=scene.obs_point[keep], pixels=pixels)
+    poses, points = perturbed(scene, rng, 0.005, 0.02)
+    return problem_of(scene, num_fixed, poses, points)
+
+
 def map_of(scene, with_points=True):
     """The scene as a SparseMap, landmark ids 0..P-1; frame 10 k is keyframe k."""
     sparse_map = SparseMap()
@@ -120,6 +142,29 @@ def map_of(scene, with_points=True):
     if with_points:
         sparse_map.points_world[:] = scene.points
     return sparse_map
+
+
+def view_of(index, ids, pixels=None):
+    """A view before there is a map: tracks at pixels, at (index, index) where none are given."""
+    n = len(ids)
+    pixels = np.full((n, 2), float(index)) if pixels is None else pixels
+    tracks = Tracks(np.array(ids), pixels, np.ones(n, np.float32), np.zeros(n, np.int32), np.zeros(n, np.int32))
+    image = np.full((480, 640), index % 256, np.uint8)
+    return TrackedView(Frame(index, 10**9 * index, image), tracks, pixels, NO_MOTION)
+
+
+def plane(side=1.0, step=0.01, z=0.0):
+    """Points of a grid on a square."""
+    x, y = np.meshgrid(np.arange(0, side + 1e-9, step), np.arange(0, side + 1e-9, step))
+    return np.column_stack([x.ravel(), y.ravel(), np.full(x.size, z)])
+
+
+def room(rng, count=4000):
+    """Points on three walls and a box: no symmetry."""
+    a = rng.random((count, 2))
+    walls = [np.column_stack([4 * a[:, 0], 3 * a[:, 1], 0 * a[:, 0]]), np.column_stack([0 * a[:, 0], 3 * a[:, 0], 2 * a[:, 1]])]
+    box = np.array([1.0, 0.8, 0.0]) + np.column_stack([0.7 * a[:, 0], 0.5 * a[:, 1], np.full(count, 0.6)])
+    return np.vstack([*walls, box])
 
 
 def texture(height, width, rng, sigma=3.0):
@@ -134,3 +179,8 @@ def warped(image, A, b):
     """The picture after the motion y = A x + b."""
     size = (image.shape[1], image.shape[0])
     return cv2.warpAffine(image, np.column_stack([A, b]), size, flags=cv2.INTER_CUBIC, borderMode=cv2.BORDER_REFLECT)
+
+
+def demo_copy(folder):
+    """The demo as a sequence of that name."""
+    return Path(shutil.copytree(DEMO, folder, ignore=shutil.ignore_patterns("depth0", "scene.ply")))

@@ -6,9 +6,9 @@ from hypothesis import strategies as st
 from hypothesis.extra.numpy import arrays
 
 from vitamin3d.config import CurvatureConfig, ExtremaConfig
-from vitamin3d.tracking.curvature import _curvature, curvature
+from vitamin3d.image.curvature import _curvature, curvature
+from vitamin3d.image.extrema import detect_extrema, refine_extrema, select_free_extrema
 from vitamin3d.tracking.dominant_flow import fit_affine_flow
-from vitamin3d.tracking.extrema import detect_extrema, refine_extrema, select_free_extrema
 from vitamin3d.tracking.extrema_tracking import one_per_pixel
 from vitamin3d.types import Tracks
 
