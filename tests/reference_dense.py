@@ -5,11 +5,11 @@ import itertools
 
 import numpy as np
 
-from vitamin3d.geometry.camera import Camera
+from vitamin3d.geometry.cameras import PinholeCamera
 from vitamin3d.types import Frame, MapSnapshot
 
-EUROC = Camera(458.654, 457.296, 367.215, 248.375, 752, 480, (-0.28340811, 0.07395907, 0.00019359, 1.76187114e-05))
-SMALL = Camera(100.0, 100.0, 63.5, 47.5, 128, 96)
+EUROC = PinholeCamera(458.654, 457.296, 367.215, 248.375, 752, 480, (-0.28340811, 0.07395907, 0.00019359, 1.76187114e-05))
+SMALL = PinholeCamera(100.0, 100.0, 63.5, 47.5, 128, 96)
 
 
 def snapshot_of_plane(camera, normal, count, rng, deviation=0.01, T_cam_world=None):

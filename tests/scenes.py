@@ -10,7 +10,7 @@ import cv2
 import numpy as np
 
 from vitamin3d.bundle_adjustment.problem import BundleProblem
-from vitamin3d.geometry.camera import Camera
+from vitamin3d.geometry.cameras import Camera, PinholeCamera
 from vitamin3d.geometry.rolling_shutter import NO_MOTION
 from vitamin3d.geometry.se3 import exp_se3, log_so3
 from vitamin3d.initialization.initialization_history import TrackedView
@@ -20,8 +20,8 @@ from vitamin3d.types import Frame, Tracks
 DEMO = Path(__file__).parents[1] / "data" / "demo"
 SHORT_RUN = ("--max-frames", "45")
 """Options of the benchmark's trials in tests."""
-PINHOLE = Camera(520.0, 510.0, 321.5, 239.0, 640, 480)
-EUROC = Camera(458.654, 457.296, 367.215, 248.375, 752, 480, (-0.28340811, 0.07395907, 0.00019359, 1.76187114e-05))
+PINHOLE = PinholeCamera(520.0, 510.0, 321.5, 239.0, 640, 480)
+EUROC = PinholeCamera(458.654, 457.296, 367.215, 248.375, 752, 480, (-0.28340811, 0.07395907, 0.00019359, 1.76187114e-05))
 
 
 @dataclass(frozen=True)

@@ -79,7 +79,7 @@ def test_there_is_something_to_check():
 
 
 def test_numba_is_imported_in_two_files():
-    assert importers("numba") == {"_jit.py", "_lanes.py"}
+    assert importers("numba") == {"_jit.py", "_simd.py"}
 
 
 def test_threads_are_known_to_one_file():

@@ -9,7 +9,7 @@ import pytest
 
 from vitamin3d.atlas import Atlas
 from vitamin3d.config import AtlasConfig, Config
-from vitamin3d.geometry.camera import Camera
+from vitamin3d.geometry.cameras import Camera
 from vitamin3d.geometry.sim3_alignment import align_sim3
 from vitamin3d.localization.localizer import Localizer
 from vitamin3d.mapping.landmark_triangulation import Rigidity

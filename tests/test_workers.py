@@ -5,7 +5,7 @@ import threading
 import pytest
 
 from vitamin3d.errors import WorkerError
-from vitamin3d.workers import Clock, Consumer, Errand, ReadAhead, step
+from vitamin3d.workers import BackgroundTask, Clock, Consumer, ReadAhead, step
 
 pytestmark = pytest.mark.usefixtures("time_limit")
 
@@ -49,17 +49,17 @@ def test_a_reader_is_stopped_while_it_waits_for_room():
 
 def test_an_errand_is_run_beside_and_its_fault_comes_out():
     go = threading.Event()
-    with Errand("test") as errand:
-        errand.begin(lambda: go.wait(10) and 42)
-        assert errand.is_busy and errand.take() is None
+    with BackgroundTask("test") as task:
+        task.begin(lambda: go.wait(10) and 42)
+        assert task.is_busy and task.take() is None
         go.set()
-        assert errand.take(wait=True) == 42 and not errand.is_busy and errand.take(wait=True) is None
-        errand.begin(lambda: 1 // 0)
+        assert task.take(wait=True) == 42 and not task.is_busy and task.take(wait=True) is None
+        task.begin(lambda: 1 // 0)
         with pytest.raises(ZeroDivisionError):
-            errand.take(wait=True)
-    with Errand("test") as errand, contextlib.suppress(ZeroDivisionError):
-        errand.begin(lambda: 1 // 0)
-        while errand.take() is None:
+            task.take(wait=True)
+    with BackgroundTask("test") as task, contextlib.suppress(ZeroDivisionError):
+        task.begin(lambda: 1 // 0)
+        while task.take() is None:
             pass
 
 

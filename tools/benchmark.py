@@ -41,7 +41,7 @@ from vitamin3d.datasets import Dataset, Unreadable, open_dataset
 from vitamin3d.errors import InputError, Vitamin3dError
 from vitamin3d.exporters.files import write_file
 from vitamin3d.exporters.line_plot import Axes, Line, line_plot
-from vitamin3d.geometry.camera import Camera
+from vitamin3d.geometry.cameras import Camera
 from vitamin3d.map_output import with_voxels
 from vitamin3d.mapping.landmark_statistics import information_by_id
 from vitamin3d.reconstruction import Reconstruction

@@ -36,7 +36,7 @@ from vitamin3d.datasets import Dataset, Unreadable, open_dataset
 from vitamin3d.datasets.bal import read_bal
 from vitamin3d.errors import InputError, Vitamin3dError
 from vitamin3d.evaluation.reference_surface import depth_maps, read_depth
-from vitamin3d.geometry.camera import Camera
+from vitamin3d.geometry.cameras import Camera, PinholeCamera
 from vitamin3d.geometry.se3 import exp_se3, inverse, log_so3, transform_points
 from vitamin3d.geometry.sim3_alignment import align_sim3
 from vitamin3d.mapping.window_selection import build_problem, select_window, whole_map
@@ -175,7 +175,7 @@ def load_problem(path: Path) -> tuple[BundleProblem, Camera]:
     """The problem in ideal pixels, and the camera."""
     with np.load(path) as data:
         width, height = (int(n) for n in data["size"])
-        camera = Camera(1.0, 1.0, 0.0, 0.0, width, height).with_model(data["model"])
+        camera = PinholeCamera(1.0, 1.0, 0.0, 0.0, width, height).with_model(data["model"])
         made = make_problem(
             data["T_cam_world"], data["points_world"], data["obs_camera"], data["obs_point"], camera.undistort(data["obs_pixels"]),
             data["camera_is_free"],
@@ -310,7 +310,7 @@ def adjust_map(path: Path, sigma_px: float) -> None:
     deviation = report.deviations["f"]
     _print_map("ours", seconds, len(report.costs) - 1, found.model, f" ({report.stopped}, deviation of f {deviation:.2f})")
     ceres = ceres_solver()
-    if ceres and not any(camera.distortion[2:]):
+    if ceres and camera.parameters["p1"] == camera.parameters["p2"] == 0.0:
         measured = dataclasses.replace(problem, obs_pixels=camera.distort(problem.obs_pixels))
         run = ceres(measured, camera.model[None], sigma_px, 100, 1e-6)
         _print_map("ceres", run.seconds, run.iterations, run.models[0], "")

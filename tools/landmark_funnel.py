@@ -20,7 +20,7 @@ from vitamin3d.config import Config, load_toml
 from vitamin3d.datasets import Unreadable, open_dataset
 from vitamin3d.errors import InputError, Vitamin3dError
 from vitamin3d.exporters.files import write_file
-from vitamin3d.geometry.camera import Camera
+from vitamin3d.geometry.cameras import Camera
 from vitamin3d.localization.localizer import Localizer
 from vitamin3d.mapping.landmark_statistics import keyframe_vertices, landmark_information, landmark_statistics, relative_depth_deviations
 from vitamin3d.mapping.visible_landmarks import with_unobserved

@@ -18,7 +18,7 @@ import cv2
 import numpy as np
 
 from vitamin3d._jit import inlined, kernel
-from vitamin3d.geometry.camera import Camera
+from vitamin3d.geometry.cameras import PinholeCamera
 from vitamin3d.geometry.se3 import exp_so3, quaternion_xyzw
 from vitamin3d.types import Array
 
@@ -542,9 +542,9 @@ def sphere_points(count: int, random: np.random.Generator) -> Array:
 # The camera
 
 
-def demo_camera(width: int, height: int) -> Camera:
+def demo_camera(width: int, height: int) -> PinholeCamera:
     """EuRoC's lens on a picture of this size."""
-    return Camera(0.61 * width, 0.608 * width, 0.4883 * width, 0.5174 * height, width, height, EUROC_DISTORTION)
+    return PinholeCamera(0.61 * width, 0.608 * width, 0.4883 * width, 0.5174 * height, width, height, EUROC_DISTORTION)
 
 
 def pose_at(seconds: float) -> Array:
@@ -565,21 +565,21 @@ def pose_at(seconds: float) -> Array:
     return T
 
 
-def rays_of(camera: Camera, samples: int) -> Array:
+def rays_of(camera: PinholeCamera, samples: int) -> Array:
     """(H · W · samples², 3) rays with z = 1; the samples of a pixel are neighbours in the last axis of the grid."""
     steps = (np.arange(samples) + 0.5) / samples - 0.5
     v, u, dv, du = np.meshgrid(np.arange(camera.height), np.arange(camera.width), steps, steps, indexing="ij")
     return camera.rays_from_ideal(camera.undistort(np.stack([(u + du).ravel(), (v + dv).ravel()], 1)))
 
 
-def picture(scene: Scene, camera: Camera, T_world_cam: Array, rays: Array, samples: int) -> Array:
+def picture(scene: Scene, camera: PinholeCamera, T_world_cam: Array, rays: Array, samples: int) -> Array:
     """(H, W, 3) sRGB in 0–255, float."""
     linear = scene.colors(T_world_cam[:3, 3], rays @ T_world_cam[:3, :3].T, 1.0 / (camera.fx * samples))
     mean = linear.reshape(camera.height, camera.width, samples * samples, 3).mean(axis=2)
     return np.asarray(255.0 * (mean / (1.0 + 0.18 * mean)) ** (1 / 2.2))
 
 
-def depth_map(scene: Scene, camera: Camera, T_world_cam: Array) -> Array:
+def depth_map(scene: Scene, camera: PinholeCamera, T_world_cam: Array) -> Array:
     """(H, W) uint16 millimetres along z at the pixels' centres, 0 = none."""
     depth = scene.depth(T_world_cam[:3, 3], rays_of(camera, 1) @ T_world_cam[:3, :3].T)
     millimetres = np.where(np.isfinite(depth) & (depth < 65), np.round(1000 * depth), 0)
@@ -589,7 +589,7 @@ def depth_map(scene: Scene, camera: Camera, T_world_cam: Array) -> Array:
 # Files
 
 
-def write_sensor(path: Path, camera: Camera) -> None:
+def write_sensor(path: Path, camera: PinholeCamera) -> None:
     numbers_ = ", ".join(f"{value:.6g}" for value in (camera.fx, camera.fy, camera.cx, camera.cy))
     lens = ", ".join(f"{value:.9g}" for value in camera.distortion)
     path.write_text(
@@ -656,10 +656,10 @@ def render(args: argparse.Namespace) -> None:
     write_scene(out / "scene.ply", scene_patches(10.0, args.seed))
 
 
-def rounded(camera: Camera) -> Camera:
+def rounded(camera: PinholeCamera) -> PinholeCamera:
     """The camera as its file will say it."""
     fx, fy, cx, cy = (float(f"{value:.6g}") for value in (camera.fx, camera.fy, camera.cx, camera.cy))
-    return Camera(fx, fy, cx, cy, camera.width, camera.height, camera.distortion)
+    return PinholeCamera(fx, fy, cx, cy, camera.width, camera.height, camera.distortion)
 
 
 def parsed(argv: list[str] | None) -> argparse.Namespace:

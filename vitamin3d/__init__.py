@@ -19,7 +19,7 @@ if TYPE_CHECKING:
     from vitamin3d.evaluation.finished_run import TruthRequest, read_run, read_truth
     from vitamin3d.evaluation.run_evaluation import evaluate
     from vitamin3d.exporters.output_folder import OutputFolder
-    from vitamin3d.geometry.camera import Camera
+    from vitamin3d.geometry.cameras import Camera, PinholeCamera
     from vitamin3d.job import Job, Selection, reconstruct_sequence
     from vitamin3d.mapping.landmark_statistics import point_cloud
     from vitamin3d.reconstruction import Reconstruction
@@ -43,7 +43,7 @@ _HOMES = {
     "evaluation.finished_run": ("TruthRequest", "read_run", "read_truth"),
     "evaluation.run_evaluation": ("evaluate",),
     "exporters.output_folder": ("OutputFolder",),
-    "geometry.camera": ("Camera",),
+    "geometry.cameras": ("Camera", "PinholeCamera"),
     "mapping.landmark_statistics": ("point_cloud",),
     "job": ("Job", "Selection", "reconstruct_sequence"),
     "reconstruction": ("Reconstruction",),
@@ -66,6 +66,7 @@ __all__ = [
     "FrontEnd",
     "Job",
     "OutputFolder",
+    "PinholeCamera",
     "Reconstruction",
     "Scale",
     "Selection",

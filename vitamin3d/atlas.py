@@ -8,7 +8,7 @@ camera found in it, or the new one once it has held for a while. A map that was 
 import numpy as np
 
 from vitamin3d.config import Config
-from vitamin3d.geometry.camera import Camera
+from vitamin3d.geometry.cameras import Camera
 from vitamin3d.mapping.window_adjustment import SharedAdjuster
 from vitamin3d.slam import Slam
 from vitamin3d.slam_steps import SlamSteps

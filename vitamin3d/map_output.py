@@ -9,7 +9,7 @@ from typing import Any
 from vitamin3d.config import Config
 from vitamin3d.dense.stages import staged
 from vitamin3d.exporters.output_folder import MapFolder
-from vitamin3d.geometry.camera import Camera
+from vitamin3d.geometry.cameras import Camera
 from vitamin3d.geometry.se3 import inverse
 from vitamin3d.mapping.landmark_statistics import point_cloud
 from vitamin3d.reconstruction import Reconstruction

@@ -7,7 +7,7 @@ from vitamin3d.config import Config
 from vitamin3d.dense.depth_rendering import DepthRenderer
 from vitamin3d.dense.stages import Chain, Checking, Densifying, Meshing
 from vitamin3d.dense.volumes import Volumes
-from vitamin3d.geometry.camera import Camera
+from vitamin3d.geometry.cameras import Camera
 from vitamin3d.steps import Mesher, Stage, Volume
 from vitamin3d.types import Array, DepthView, MapSnapshot, StepTimes, Surface
 

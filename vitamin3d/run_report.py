@@ -102,7 +102,7 @@ def _report(out: Path, dataset: Dataset, frames: list[Picture], stamps: list[str
         _cards(stats, surface),
         keyframes.T_world_cam,
         trajectory.T_world_cam[:, :3, 3],
-        (0.5 * camera.width / camera.fx, 0.5 * camera.height / camera.fy),
+        camera.half_field,
         surface,
         points,
         colors,

@@ -12,7 +12,7 @@ import numpy as np
 
 from vitamin3d.atlas import Atlas
 from vitamin3d.exporters.output_folder import MAPS
-from vitamin3d.geometry.camera import Camera
+from vitamin3d.geometry.cameras import Camera
 from vitamin3d.map_output import MapOutput
 from vitamin3d.mapping.calibration_refinement import CalibrationRefinement
 from vitamin3d.runtime import RunRecord, median_of
@@ -73,8 +73,7 @@ def calibration_table(camera: Camera, refinement: CalibrationRefinement) -> dict
 
 
 def _camera_table(camera: Camera) -> dict[str, float]:
-    names = ("fx", "fy", "cx", "cy", "k1", "k2", "p1", "p2", "readout_s")
-    return dict(zip(names, [*camera.model.tolist(), camera.readout_s], strict=True))
+    return {**camera.parameters, "readout_s": camera.readout_s}
 
 
 LATE_MS = 50.0

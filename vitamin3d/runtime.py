@@ -24,18 +24,18 @@ from vitamin3d.mapping.window_adjustment import AdjustAtOnce, WindowAdjustment
 from vitamin3d.slam import Slam
 from vitamin3d.tracking.front_end import FrontEnd
 from vitamin3d.types import Array, Frame, FrontEndFrame, MapSnapshot, NewestFrame, SlamState
-from vitamin3d.workers import Clock, Consumer, Errand, ReadAhead, step
+from vitamin3d.workers import BackgroundTask, Clock, Consumer, ReadAhead, step
 
 READ_AHEAD = 4
 SNAPSHOTS_AHEAD, LIVE_SNAPSHOTS_AHEAD = 8, 3
 ADJUSTMENT_NICENESS, DENSE_NICENESS = 3, 10
 """In live runs the front end comes first, then the map, then the mesh."""
 
-KeyframeHand = Callable[[Slam, int, Frame, bool], None]
+KeyframeHandler = Callable[[Slam, int, Frame, bool], None]
 """Takes a settled keyframe of a map and its picture; True: the recording is over."""
 SnapshotConsumer = Callable[[Iterator[MapSnapshot | NewestFrame]], None]
 """Consumes keyframes as they come, on a thread of its own; in live runs, while none comes, it hears how late it is."""
-TimeHand = Callable[[int], None]
+TimeHandler = Callable[[int], None]
 """Hears of each frame's time (ns) when the frame is done."""
 SnapshotSink = Callable[[MapSnapshot], None]
 
@@ -97,9 +97,9 @@ class RunRecord:
 class _Run:
     """The steps of a run on the mapping thread, shared by all ways of running."""
 
-    def __init__(self, atlas: Atlas, record: RunRecord, observer: Observer, hand: KeyframeHand, clock: Clock | None = None) -> None:
-        self.atlas, self.record, self.observer, self.hand, self.clock = atlas, record, observer, hand, clock
-        self.tell_time: TimeHand = lambda timestamp_ns: None
+    def __init__(self, atlas: Atlas, record: RunRecord, observer: Observer, handle: KeyframeHandler, clock: Clock | None = None) -> None:
+        self.atlas, self.record, self.observer, self.handle, self.clock = atlas, record, observer, handle, clock
+        self.tell_time: TimeHandler = lambda timestamp_ns: None
 
     def all_frames(self, fronts: Iterable[FrontEndFrame | Unreadable]) -> RunRecord:
         """Frame by frame until the end, or until the observer stops it; then the last keyframes are handed over."""
@@ -110,7 +110,7 @@ class _Run:
             self.frame(front)
         with step("mapping"):
             self.atlas.take_adjustment(wait=True)
-        self.hand_over(everything=True)
+        self.deliver_keyframes(everything=True)
         return self.record
 
     def frame(self, front: FrontEndFrame | Unreadable) -> None:
@@ -126,15 +126,15 @@ class _Run:
             if self.clock is not None and self.record.latencies is not None:
                 self.record.latencies.append((front.frame.index, self.clock.seconds_since(front.frame.timestamp_ns)))
             self._record_tracks(front.frame.index)
-            self.hand_over()
+            self.deliver_keyframes()
             self.tell_time(front.frame.timestamp_ns)
         done = len(self.record.skipped) + len(self.record.states)
         self.observer.frame_done(done, self.record.num_frames, self.atlas)
 
-    def hand_over(self, everything: bool = False) -> None:
+    def deliver_keyframes(self, everything: bool = False) -> None:
         """Keyframes that nothing will move any more go to the dense half."""
         for slam, keyframe, frame in self.atlas.take_settled_keyframes(everything):
-            self.hand(slam, keyframe, frame, everything)
+            self.handle(slam, keyframe, frame, everything)
 
     def _record_tracks(self, frame_index: int) -> None:
         slam = self.atlas.current
@@ -164,7 +164,7 @@ def run_sequential(
         WorkerError: a step failed; it names the step.
     """
     record = _begin(indices, record)
-    run = _Run(atlas, record, observer or SilentObserver(), _hand_to(record, sink))
+    run = _Run(atlas, record, observer or SilentObserver(), _deliver_to(record, sink))
     return run.all_frames(_front_frames(_pictures(dataset, indices), front_end, record))
 
 
@@ -182,7 +182,7 @@ def run_threaded(
     with ExitStack() as threads:
         put = threads.enter_context(Consumer(_each_to(sink), "dense", SNAPSHOTS_AHEAD)).put if sink else None
         fronts = threads.enter_context(_fronts_ahead(threads, _pictures(dataset, indices), front_end, record))
-        return _Run(atlas, record, observer or SilentObserver(), _hand_to(record, put)).all_frames(fronts)
+        return _Run(atlas, record, observer or SilentObserver(), _deliver_to(record, put)).all_frames(fronts)
 
 
 def run_live(
@@ -212,13 +212,13 @@ def run_live(
         threads.callback(gc.unfreeze)
         dense = threads.enter_context(Consumer(consume, "dense", LIVE_SNAPSHOTS_AHEAD, DENSE_NICENESS)) if consume else None
         if clock is not None:
-            adjuster: Errand[WindowAdjustment] = Errand("adjustment", ADJUSTMENT_NICENESS)
+            adjuster: BackgroundTask[WindowAdjustment] = BackgroundTask("adjustment", ADJUSTMENT_NICENESS)
             atlas.adjuster.work_with(threads.enter_context(adjuster))
             threads.callback(lambda: atlas.adjuster.work_with(AdjustAtOnce()))
         fronts = threads.enter_context(_fronts_ahead(threads, _pictures(dataset, indices), front_end, record, clock))
         if clock is not None:
             threads.callback(clock.cancel)
-        run = _Run(atlas, record, observer or SilentObserver(), _hand_or_drop(record, dense), clock)
+        run = _Run(atlas, record, observer or SilentObserver(), _deliver_or_drop(record, dense), clock)
         if dense is not None:
             run.tell_time = _tell_while_waiting(dense)
         run.all_frames(fronts)
@@ -273,7 +273,7 @@ def _each_to(sink: SnapshotSink) -> SnapshotConsumer:
     return consume
 
 
-def _tell_while_waiting(dense: Consumer) -> TimeHand:
+def _tell_while_waiting(dense: Consumer) -> TimeHandler:
     def tell(timestamp_ns: int) -> None:
         if dense.is_waiting:
             dense.put(NewestFrame(timestamp_ns))
@@ -281,22 +281,22 @@ def _tell_while_waiting(dense: Consumer) -> TimeHand:
     return tell
 
 
-def _hand_to(record: RunRecord, sink: SnapshotSink | None) -> KeyframeHand:
+def _deliver_to(record: RunRecord, sink: SnapshotSink | None) -> KeyframeHandler:
     """Every keyframe goes to `sink`, which may take its time."""
 
-    def hand(slam: Slam, keyframe: int, frame: Frame, _: bool) -> None:
+    def handle(slam: Slam, keyframe: int, frame: Frame, _: bool) -> None:
         if sink is not None:
             record.keyframes_offered += 1
             with step(f"meshing and fusing frame {frame.index}"):
                 sink(slam.snapshot(keyframe, frame))
 
-    return hand
+    return handle
 
 
-def _hand_or_drop(record: RunRecord, dense: Consumer | None) -> KeyframeHand:
+def _deliver_or_drop(record: RunRecord, dense: Consumer | None) -> KeyframeHandler:
     """A keyframe for which the dense half has no room is dropped, unless the recording is over."""
 
-    def hand(slam: Slam, keyframe: int, frame: Frame, is_over: bool) -> None:
+    def handle(slam: Slam, keyframe: int, frame: Frame, is_over: bool) -> None:
         if dense is None:
             return
         record.keyframes_offered += 1
@@ -305,7 +305,7 @@ def _hand_or_drop(record: RunRecord, dense: Consumer | None) -> KeyframeHand:
         else:
             record.keyframes_dropped += 1
 
-    return hand
+    return handle
 
 
 def median_of(values: list[int]) -> float:

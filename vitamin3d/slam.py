@@ -4,7 +4,7 @@
 import numpy as np
 
 from vitamin3d.config import Config
-from vitamin3d.geometry.camera import Camera
+from vitamin3d.geometry.cameras import Camera
 from vitamin3d.geometry.se3 import inverse
 from vitamin3d.initialization.heritage import Heritage
 from vitamin3d.initialization.initializer import Beginning, Initializer

@@ -6,7 +6,7 @@ from dataclasses import dataclass
 
 from vitamin3d.bundle_adjustment.adjust import adjust_bundle
 from vitamin3d.config import Config
-from vitamin3d.geometry.camera import Camera
+from vitamin3d.geometry.cameras import Camera
 from vitamin3d.localization.localizer import Localizer
 from vitamin3d.localization.pose_log import PoseLog
 from vitamin3d.steps import BundleSolver, CameraLocalizer, LandmarkMapper, LandmarkTracker

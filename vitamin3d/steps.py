@@ -12,7 +12,7 @@ from typing import Protocol, TypeVar
 from vitamin3d.bundle_adjustment.marginalization import CameraPrior
 from vitamin3d.bundle_adjustment.problem import BundleProblem
 from vitamin3d.config import BundleAdjustmentConfig
-from vitamin3d.geometry.camera import Camera
+from vitamin3d.geometry.cameras import Camera
 from vitamin3d.sparse_map import SparseMap
 from vitamin3d.types import (
     Array,

@@ -15,7 +15,7 @@ from vitamin3d.config import Config, live_config, paper_config
 from vitamin3d.exporters.depth_map import counts_from_depth
 from vitamin3d.exporters.mesh import obj_text
 from vitamin3d.exporters.normal_map import rgb_from_normals
-from vitamin3d.geometry.camera import Camera
+from vitamin3d.geometry.cameras import Camera, PinholeCamera
 from vitamin3d.mapping.landmark_statistics import point_cloud
 from vitamin3d.reconstruction import Reconstruction
 from vitamin3d.slam import Slam
@@ -34,7 +34,7 @@ Tell = Callable[[int, int, str], None]
 
 def relief_camera() -> Camera:
     """The camera of `relief_frames`, slightly distorted so that the kernels of distortion are called."""
-    return Camera(FOCAL, FOCAL, (WIDTH - 1) / 2, (HEIGHT - 1) / 2, WIDTH, HEIGHT, (-0.01, 0.0, 0.0, 0.0))
+    return PinholeCamera(FOCAL, FOCAL, (WIDTH - 1) / 2, (HEIGHT - 1) / 2, WIDTH, HEIGHT, (-0.01, 0.0, 0.0, 0.0))
 
 
 def relief_frames(count: int = NUM_FRAMES, seed: int = 0) -> Iterator[Frame]:

@@ -215,7 +215,7 @@ class Consumer(_Thread):
         self._channel.close()
 
 
-class Errand(_Thread, Generic[Result]):
+class BackgroundTask(_Thread, Generic[Result]):
     """One task at a time on a thread of its own: `begin` one, go on, `take` what it came to."""
 
     def __init__(self, name: str, niceness: int = 0) -> None:
@@ -224,7 +224,7 @@ class Errand(_Thread, Generic[Result]):
         self.is_busy = False
         """A task was begun and its result is not taken yet."""
 
-    def __enter__(self) -> "Errand[Result]":
+    def __enter__(self) -> "BackgroundTask[Result]":
         self._thread.start()
         return self
 

@@ -11,7 +11,7 @@ from vitamin3d.bundle_adjustment.adjust import SOLVERS, AdjustmentSettings, adju
 from vitamin3d.bundle_adjustment.problem import make_problem
 from vitamin3d.bundle_adjustment.variables import Variables, pinhole_model, squared_errors_of
 from vitamin3d.errors import InputError
-from vitamin3d.geometry.camera import Camera
+from vitamin3d.geometry.cameras import PinholeCamera
 
 MODEL = pinhole_model(PINHOLE)
 SIGMA = 2.0
@@ -198,5 +198,5 @@ def test_a_problem_without_observations_is_returned_as_it_is():
 
 
 def test_the_camera_class_is_one_way_to_a_model():
-    lens = Camera(400.0, 410.0, 320.0, 240.0, 640, 480, (-0.2, 0.05, 1e-3, 2e-3))
+    lens = PinholeCamera(400.0, 410.0, 320.0, 240.0, 640, 480, (-0.2, 0.05, 1e-3, 2e-3))
     assert lens.with_model(lens.model) == lens

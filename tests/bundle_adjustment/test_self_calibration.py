@@ -6,11 +6,11 @@ import pytest
 from scenes import EUROC, PINHOLE, arc_scene, orbit, perturbed, problem_of, project
 
 from vitamin3d._jit import kernel
-from vitamin3d._lanes import lanes, total
+from vitamin3d._simd import splat, total
 from vitamin3d.bundle_adjustment.problem import points_of_long_tracks, select_points
 from vitamin3d.bundle_adjustment.self_calibration import adjust_with_intrinsics, parameter_basis
 from vitamin3d.errors import InputError
-from vitamin3d.geometry.reprojection import fill_model_derivatives, in_camera, linearize_lanes, model_of, pose_of, squared_error_lanes
+from vitamin3d.geometry.reprojection import fill_model_derivatives, in_camera, linearize_simd, model_of, pose_of, squared_error_simd
 from vitamin3d.geometry.se3 import exp_se3
 
 SIGMA = 2.0
@@ -20,10 +20,10 @@ LENS = EUROC.with_model([460.0, 455.0, 367.0, 248.0, -0.25, 0.06, 1e-3, -5e-4])
 @kernel
 def run_linearize(models, is_distorted, R, t, points, pixels):
     """Eight times the same, added up: q a b r0 r1 p00 p01 p10 p11, and |r|²."""
-    x, y, z = in_camera(pose_of(R, t, 0), lanes(points[0, 0]), lanes(points[0, 1]), lanes(points[0, 2]))
-    u, v, model = lanes(pixels[0, 0]), lanes(pixels[0, 1]), model_of(models, 0)
-    _, q, a, b, r0, r1, p00, p01, p10, p11 = linearize_lanes(x, y, z, is_distorted, model, u, v)
-    e = squared_error_lanes(x, y, z, is_distorted, model, u, v)
+    x, y, z = in_camera(pose_of(R, t, 0), splat(points[0, 0]), splat(points[0, 1]), splat(points[0, 2]))
+    u, v, model = splat(pixels[0, 0]), splat(pixels[0, 1]), model_of(models, 0)
+    _, q, a, b, r0, r1, p00, p01, p10, p11 = linearize_simd(x, y, z, is_distorted, model, u, v)
+    e = squared_error_simd(x, y, z, is_distorted, model, u, v)
     return total(q), total(a), total(b), total(r0), total(r1), total(p00), total(p01), total(p10), total(p11), total(e)
 
 

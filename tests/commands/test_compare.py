@@ -94,10 +94,10 @@ def test_a_stray_point_is_an_error_unless_it_may_be_left_out(run, other, command
     with (other / "MapPoints.txt").open("a") as file:
         file.write("20000 0 0\n")
     error = command("compare", run, other).error
-    assert "MapPoints.txt: 1 points" in error and "--drop-strays" in error and not (run / "comparison").exists()
-    told = command("compare", run, other, "--drop-strays")
+    assert "MapPoints.txt: 1 points" in error and "--drop-outliers" in error and not (run / "comparison").exists()
+    told = command("compare", run, other, "--drop-outliers")
     assert told.code == 0 and told.err.startswith("warning: ") and "MapPoints.txt: 1 points" in told.err
-    assert items_of(run / "comparison")[1]["orbslam3/demo"]["strays"] == 1
+    assert items_of(run / "comparison")[1]["orbslam3/demo"]["outliers"] == 1
 
 
 def test_a_stray_point_of_a_scan_is_an_error_too(run, other, command, tmp_path):
@@ -105,8 +105,8 @@ def test_a_stray_point_of_a_scan_is_an_error_too(run, other, command, tmp_path):
     for name, rest in (("evaluate", ()), ("compare", (other,))):
         arguments = (name, run, *rest, "-g", DEMO, "--reference", tmp_path / "scan.xyz", "-o", tmp_path / name)
         error = command(*arguments).error
-        assert "scan.xyz: 1 points" in error and "--drop-strays" in error and not (tmp_path / name).exists()
-        told = command(*arguments, "--drop-strays")
+        assert "scan.xyz: 1 points" in error and "--drop-outliers" in error and not (tmp_path / name).exists()
+        told = command(*arguments, "--drop-outliers")
         assert told.code == 0 and told.err.startswith("warning: ") and "scan.xyz: 1 points" in told.err
 
 

@@ -90,21 +90,21 @@ def test_stray_points_are_left_out_and_counted(points, tmp_path):
     far = np.vstack([np.tile(points, (4, 1)), [[2000.0, 0, 0], [np.nan, 0, 0]]])
     np.savetxt(tmp_path / "far.xyz", far)
     found = read_geometry(tmp_path / "far.xyz")
-    assert (len(found.points), found.strays) == (200, 2)
+    assert (len(found.points), found.outliers) == (200, 2)
 
 
 def test_triangles_of_strays_go_with_them(tmp_path):
     body = b"".join(f"{k % 8} {k // 8} 0\n".encode() for k in range(64)) + b"5000 0 0\n3 0 1 8\n3 0 1 64\n"
     found = read_geometry(ply(tmp_path / "m.ply", body, 65, "element face 2\nproperty list uchar int vertex_indices\n"))
-    assert found.triangles.tolist() == [[0, 1, 8]] and found.strays == 1
+    assert found.triangles.tolist() == [[0, 1, 8]] and found.outliers == 1
 
 
 def test_a_cloud_that_really_is_long_keeps_its_end(rng):
-    """A tenth of the points far away is a shape, not a stray."""
-    from vitamin3d.datasets.point_files import NO_TRIANGLES, Geometry, without_strays
+    """A tenth of the points far away is a shape, not an outlier."""
+    from vitamin3d.datasets.point_files import NO_TRIANGLES, Geometry, without_outliers
 
     points = np.vstack([0.01 * rng.standard_normal((95, 3)), np.array([100.0, 0, 0]) + rng.standard_normal((5, 3))])
-    assert without_strays(Geometry(points, NO_TRIANGLES), None).strays == 0
+    assert without_outliers(Geometry(points, NO_TRIANGLES), None).outliers == 0
 
 
 @pytest.mark.parametrize(

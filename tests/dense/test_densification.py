@@ -9,12 +9,12 @@ import reference_dense as reference
 from vitamin3d.config import Config, DelaunayConfig, DensificationConfig, SurfaceConfig
 from vitamin3d.dense.densification import CanvasPicture, Densifier
 from vitamin3d.dense.view_graph import Neighbourhood
-from vitamin3d.geometry.camera import Camera
+from vitamin3d.geometry.cameras import PinholeCamera
 from vitamin3d.geometry.se3 import exp_se3, inverse
 from vitamin3d.reconstruction import Reconstruction
 from vitamin3d.types import Frame, MapSnapshot
 
-CAMERA = Camera(220.0, 220.0, 127.5, 95.5, 256, 192)
+CAMERA = PinholeCamera(220.0, 220.0, 127.5, 95.5, 256, 192)
 NORMAL, OFFSET = np.array([0.1, 0.2, 1.0]), 3.0
 INSIDE = np.zeros((CAMERA.height, CAMERA.width), bool)
 

@@ -7,10 +7,10 @@ from vitamin3d.config import DensificationConfig
 from vitamin3d.dense import plane_sweep
 from vitamin3d.dense.plane_sweep import PlaneSweep, census, turned
 from vitamin3d.errors import InputError
-from vitamin3d.geometry.camera import Camera
+from vitamin3d.geometry.cameras import PinholeCamera
 from vitamin3d.geometry.se3 import exp_se3
 
-TINY = Camera(20.0, 21.0, 10.3, 7.6, 22, 16)
+TINY = PinholeCamera(20.0, 21.0, 10.3, 7.6, 22, 16)
 CAMERA = reference.SMALL
 
 

@@ -5,9 +5,9 @@ import numpy as np
 from scenes import plane
 
 from vitamin3d.evaluation.reference_surface import observed_by, thinned, voxel_keys
-from vitamin3d.geometry.camera import Camera
+from vitamin3d.geometry.cameras import PinholeCamera
 
-CAMERA = Camera(100.0, 100.0, 49.5, 39.5, 100, 80)
+CAMERA = PinholeCamera(100.0, 100.0, 49.5, 39.5, 100, 80)
 
 
 def test_thinning_takes_the_mean_of_each_voxel(rng):

@@ -2,9 +2,9 @@
 import numpy as np
 
 from vitamin3d.exporters.rendering import draw_points, side_by_side
-from vitamin3d.geometry.camera import Camera
+from vitamin3d.geometry.cameras import PinholeCamera
 
-CAMERA = Camera(100.0, 100.0, 49.5, 39.5, 100, 80)
+CAMERA = PinholeCamera(100.0, 100.0, 49.5, 39.5, 100, 80)
 
 
 def test_the_nearest_point_is_in_front():

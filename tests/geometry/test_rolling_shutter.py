@@ -5,7 +5,7 @@ import numpy as np
 import pytest
 from scenes import EUROC, PINHOLE, texture
 
-from vitamin3d.geometry.camera import Camera
+from vitamin3d.geometry.cameras import PinholeCamera
 from vitamin3d.geometry.rolling_shutter import NO_MOTION, at_one_moment, fit_image_motion, ideal_pixels, measured_pixels, row_shift
 from vitamin3d.geometry.se3 import exp_se3
 from vitamin3d.types import Frame
@@ -97,7 +97,7 @@ def test_what_a_turning_camera_reads_row_by_row_is_carried_to_one_moment(rng):
 
 
 def test_a_picture_is_carried_to_one_moment(rng):
-    camera, motion = Camera(300, 300, 160, 120, 320, 240, readout_s=0.03), NO_MOTION.copy()
+    camera, motion = PinholeCamera(300, 300, 160, 120, 320, 240, readout_s=0.03), NO_MOTION.copy()
     motion[0, 0] = 400.0
     still = texture(240, 320, rng)
     shifts = 0.03 * ((np.arange(240) + 0.5) / 240 - 0.5) * 400.0
@@ -111,5 +111,5 @@ def test_a_picture_is_carried_to_one_moment(rng):
 
 def test_a_picture_of_a_camera_at_rest_or_without_rolling_shutter_is_left_alone(rng):
     frame = Frame(0, 0, texture(240, 320, rng))
-    assert at_one_moment(frame, NO_MOTION, Camera(300, 300, 160, 120, 320, 240, readout_s=0.03)) is frame
-    assert at_one_moment(frame, PAN, Camera(300, 300, 160, 120, 320, 240)) is frame
+    assert at_one_moment(frame, NO_MOTION, PinholeCamera(300, 300, 160, 120, 320, 240, readout_s=0.03)) is frame
+    assert at_one_moment(frame, PAN, PinholeCamera(300, 300, 160, 120, 320, 240)) is frame

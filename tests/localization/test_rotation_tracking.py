@@ -10,7 +10,7 @@ from scenes import PINHOLE, project, texture
 from scipy.spatial.transform import Rotation
 
 from vitamin3d.config import Config, RotationConfig
-from vitamin3d.geometry.camera import Camera
+from vitamin3d.geometry.cameras import PinholeCamera
 from vitamin3d.localization.rotation_tracking import Directions, Turns, rotation_of, unit_rays
 from vitamin3d.slam import Slam
 from vitamin3d.tracking.front_end import FrontEnd
@@ -237,7 +237,7 @@ def test_the_camera_has_turned_when_it_is_more_than_a_shake(step_deg, has_turned
 
 
 def test_a_camera_on_a_tripod_turns_and_makes_no_map():
-    camera, sky_map = Camera(260.0, 260.0, 159.5, 119.5, 320, 240), texture(600, 1600, np.random.default_rng(5), 3.0)
+    camera, sky_map = PinholeCamera(260.0, 260.0, 159.5, 119.5, 320, 240), texture(600, 1600, np.random.default_rng(5), 3.0)
     slam, front_end, states = Slam(camera, Config()), FrontEnd(Config()), []
     u, v = np.meshgrid(np.arange(320.0), np.arange(240.0))
     rays = unit_rays(np.column_stack([u.ravel(), v.ravel()]), camera)

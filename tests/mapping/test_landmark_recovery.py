@@ -7,7 +7,7 @@ import reference
 from scenes import texture, warped
 
 from vitamin3d.config import CurvatureConfig, ExtremaConfig, RecoveryConfig
-from vitamin3d.geometry.camera import Camera
+from vitamin3d.geometry.cameras import PinholeCamera
 from vitamin3d.geometry.rolling_shutter import NO_MOTION
 from vitamin3d.geometry.se3 import exp_se3, inverse
 from vitamin3d.image.curvature import curvature
@@ -23,7 +23,7 @@ from vitamin3d.mapping.landmark_recovery import (
 from vitamin3d.sparse_map import SparseMap
 from vitamin3d.types import Tracks
 
-CAMERA = Camera(260.0, 255.0, 160.0, 119.0, 320, 240)
+CAMERA = PinholeCamera(260.0, 255.0, 160.0, 119.0, 320, 240)
 DEPTH, SHIFT = 5.0, np.array([7.0, -4.0])
 MOVED = np.eye(4)
 MOVED[:2, 3] = SHIFT * DEPTH / [CAMERA.fx, CAMERA.fy]

@@ -98,7 +98,7 @@ def test_surfaces_agree_with_the_scorer(sequence: str, kind: str, tmp_path: Path
         shutil.copy(theirs / "points.ply", file)
     else:
         write_ply(plates(read_geometry(theirs / "points.ply").points), file, [])
-    found = evaluate(tmp_path, sequence, "--surface", "--drop-strays")
+    found = evaluate(tmp_path, sequence, "--surface", "--drop-outliers")
     expected = score("surface", sequence, tmp_path / "trajectory.tum", file)
     for figures, unit in ((SURFACE, "_cm"), (SHARES, "")):
         for name in figures:

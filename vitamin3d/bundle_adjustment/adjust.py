@@ -23,7 +23,7 @@ from vitamin3d.bundle_adjustment.subspace import adjust_by_inner_sweeps, adjust_
 from vitamin3d.bundle_adjustment.variables import Progress, Variables, free_slots, pinhole_model, sightings_of
 from vitamin3d.config import BundleAdjustmentConfig
 from vitamin3d.errors import InputError
-from vitamin3d.geometry.camera import Camera
+from vitamin3d.geometry.cameras import Camera
 from vitamin3d.types import Array, BundleReport
 
 SOLVERS: dict[str, Callable[[BundleProblem, Camera, float, int, float], tuple[BundleProblem, BundleReport]]] = {

@@ -12,7 +12,7 @@ from typing import NamedTuple
 import numpy as np
 
 from vitamin3d._jit import inlined, kernel
-from vitamin3d._lanes import WIDTH, gather, lanes, load, scatter, select, square_root, store, total, transposed
+from vitamin3d._simd import WIDTH, gather, load, scatter, select, splat, square_root, store, total, transposed
 from vitamin3d.bundle_adjustment.observations import (
     Sightings,
     Views,
@@ -84,7 +84,7 @@ class NormalEquations(NamedTuple):
 @inlined
 def no_camera():  # type: ignore[no-untyped-def]
     """The empty sum of `add_camera`."""
-    z = lanes(0.0)
+    z = splat(0.0)
     return (z, z, z, z, z, z, z, z, z, z, z, z, z, z, z, z, z, z, z, z, z, z, z, z, z, z, z)
 
 
@@ -92,7 +92,7 @@ def no_camera():  # type: ignore[no-untyped-def]
 def add_camera(s, q, a, b, g00, g01, g11, h0, h1):  # type: ignore[no-untyped-def]
     """Adds observations to Jᵀ h (6) and Jᵀ G J (21, upper triangle by rows) of a camera, eight sums each.
 
-    J is that of `linearize_lanes` without p; m = G (a, b), n = G (-b, a), written out: there is no time for loops.
+    J is that of `linearize_simd` without p; m = G (a, b), n = G (-b, a), written out: there is no time for loops.
     """
     hz = a * h0 + b * h1
     m0, m1, n0, n1 = g00 * a + g01 * b, g01 * a + g11 * b, g01 * a - g00 * b, g11 * a - g01 * b
@@ -124,7 +124,7 @@ def write_camera(s, sums, H, g):  # type: ignore[no-untyped-def]
 @inlined
 def no_point():  # type: ignore[no-untyped-def]
     """The empty sum of `add_point`."""
-    z = lanes(0.0)
+    z = splat(0.0)
     return (z, z, z, z, z, z, z, z, z)
 
 
@@ -348,7 +348,7 @@ def _pose_columns(terms, n, L, model, columns, many):  # type: ignore[no-untyped
 def _by_model(W, n, K, k, L):  # type: ignore[no-untyped-def]
     """Lᵀ times column k of W[n] (3, K, 8): three lanes; zeros where there is no such column."""
     if k >= K:
-        z = lanes(0.0)
+        z = splat(0.0)
         return z, z, z
     at = WIDTH * (3 * K * n + k)
     return lifted_gradient(L, load(W, at), load(W, at + WIDTH * K), load(W, at + 2 * WIDTH * K))
@@ -465,12 +465,12 @@ def _accumulate_points(views, sightings, points, basis, inverse_squared_sigma, m
     slot, terms, Jk, W, columns = views.slot, scratch.terms, scratch.Jk, scratch.W, scratch.columns
     K, D = basis.shape[1], equations.H_cameras.shape[1]
     is_own, is_distorted = D > 6, models_are_distorted(views.models)
-    num_shared, many, nothing = 0 if is_own else K, terms.shape[0], (lanes(0.0), lanes(0.0), lanes(0.0))
+    num_shared, many, nothing = 0 if is_own else K, terms.shape[0], (splat(0.0), splat(0.0), splat(0.0))
     cost = 0.0
     for g in range(0, points.shape[0], WIDTH):
         p, is_new, first, count, longest = point_group(sightings, g)
         X, Y, Z = points_of(points, p)
-        block, costs = no_point(), lanes(0.0)
+        block, costs = no_point(), splat(0.0)
         if num_shared > 0:
             W[0] = 0.0
         for n in range(longest):
@@ -600,7 +600,7 @@ def move_points(views, moved, sightings, points, delta, inverse_squared_sigma, m
             _, _, g00, g01, g11, _, _, w00, w01, w11 = information(
                 is_there, is_seen, r0, r1, p00, p01, p10, p11, inverse_squared_sigma, most_bend
             )
-            h0, h1 = lanes(0.0), lanes(0.0)
+            h0, h1 = splat(0.0), splat(0.0)
             if is_some_free:
                 da, db = _lead(slot, c, q, a, b, delta)
                 h0, h1 = g00 * da + g01 * db, g01 * da + g11 * db
@@ -618,7 +618,7 @@ def move_points(views, moved, sightings, points, delta, inverse_squared_sigma, m
         scatter(out, 3 * p, X)
         scatter(out, 3 * p + 1, Y)
         scatter(out, 3 * p + 2, Z)
-        costs = lanes(0.0)
+        costs = splat(0.0)
         for n in range(longest):
             is_there, e = squared_error_sighting(moved, sightings, now_distorted, X, Y, Z, first, count, n)
             costs = costs + robust_cost(is_there, e, inverse_squared_sigma)

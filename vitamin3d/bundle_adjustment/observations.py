@@ -6,16 +6,16 @@ from typing import NamedTuple
 import numpy as np
 
 from vitamin3d._jit import inlined, kernel
-from vitamin3d._lanes import WIDTH, counting, gather, lanes, scatter, select, square_root, total
+from vitamin3d._simd import WIDTH, counting, gather, scatter, select, splat, square_root, total
 from vitamin3d.geometry.reprojection import (
     in_camera,
-    linearize_lanes,
+    linearize_simd,
     model_of,
     models_of,
     points_of,
     pose_of,
     poses_of,
-    squared_error_lanes,
+    squared_error_simd,
 )
 from vitamin3d.geometry.robust import geman_mcclure
 from vitamin3d.types import Array
@@ -111,20 +111,20 @@ def camera_rows(obs_point, pixels, points, i, last):  # type: ignore[no-untyped-
 
 @inlined
 def linearize_rows(sightings, points, pose, model, is_distorted, i, last):  # type: ignore[no-untyped-def]
-    """is_there, and `linearize_lanes` of a camera's observations i.."""
+    """is_there, and `linearize_simd` of a camera's observations i.."""
     _, is_there, X, Y, Z, u, v = camera_rows(sightings.camera_point, sightings.camera_pixels, points, i, last)
     x, y, z = in_camera(pose, X, Y, Z)
-    return is_there, linearize_lanes(x, y, z, is_distorted, model, u, v)
+    return is_there, linearize_simd(x, y, z, is_distorted, model, u, v)
 
 
 @inlined
 def cost_of_camera(sightings, points, pose, model, is_distorted, first, last, inverse_squared_sigma):  # type: ignore[no-untyped-def]
     """The robust cost of a camera's observations first.. to last - 1."""
-    cost = lanes(0.0)
+    cost = splat(0.0)
     for i in range(first, last, WIDTH):
         _, is_there, X, Y, Z, u, v = camera_rows(sightings.camera_point, sightings.camera_pixels, points, i, last)
         x, y, z = in_camera(pose, X, Y, Z)
-        cost = cost + robust_cost(is_there, squared_error_lanes(x, y, z, is_distorted, model, u, v), inverse_squared_sigma)
+        cost = cost + robust_cost(is_there, squared_error_simd(x, y, z, is_distorted, model, u, v), inverse_squared_sigma)
     return total(cost)
 
 
@@ -149,7 +149,7 @@ def squared_errors(views, starts, obs_point, pixels, points, out):  # type: igno
         for i in range(starts[c], starts[c + 1], WIDTH):
             rows, _, X, Y, Z, u, v = camera_rows(obs_point, pixels, points, i, starts[c + 1])
             x, y, z = in_camera(pose, X, Y, Z)
-            scatter(out, rows, squared_error_lanes(x, y, z, is_distorted, model, u, v))
+            scatter(out, rows, squared_error_simd(x, y, z, is_distorted, model, u, v))
 
 
 # --- an observation each of eight points -------------------------------------------------------------------------
@@ -179,13 +179,13 @@ def _sighting(sightings, first, count, n):  # type: ignore[no-untyped-def]
 
 @inlined
 def linearize_sighting(views, sightings, is_distorted, X, Y, Z, first, count, n):  # type: ignore[no-untyped-def]
-    """Observation n of eight points (X, Y, Z): is_there, the camera, its pose and model, and `linearize_lanes`."""
+    """Observation n of eight points (X, Y, Z): is_there, the camera, its pose and model, and `linearize_simd`."""
     R, t, _, models = views
     is_there, c, u, v = _sighting(sightings, first, count, n)
     pose = poses_of(R, t, c)
     x, y, z = in_camera(pose, X, Y, Z)
     model = models_of(models, c) if models.shape[0] > 1 else model_of(models, 0)
-    return is_there, c, pose, model, linearize_lanes(x, y, z, is_distorted, model, u, v)
+    return is_there, c, pose, model, linearize_simd(x, y, z, is_distorted, model, u, v)
 
 
 @inlined
@@ -195,7 +195,7 @@ def squared_error_sighting(views, sightings, is_distorted, X, Y, Z, first, count
     is_there, c, u, v = _sighting(sightings, first, count, n)
     x, y, z = in_camera(poses_of(R, t, c), X, Y, Z)
     model = models_of(models, c) if models.shape[0] > 1 else model_of(models, 0)
-    return is_there, squared_error_lanes(x, y, z, is_distorted, model, u, v)
+    return is_there, squared_error_simd(x, y, z, is_distorted, model, u, v)
 
 
 # --- weights -----------------------------------------------------------------------------------------------------
@@ -219,7 +219,7 @@ def information(is_there, is_seen, r0, r1, p00, p01, p10, p11, inverse_squared_s
     cost, w = geman_mcclure(e, inverse_squared_sigma)
     cost = select(is_there, select(is_seen, cost, 1.0 / inverse_squared_sigma), 0.0)
     w = select(is_there & is_seen, w, 0.0)
-    w00, w01, w11 = w, lanes(0.0), w
+    w00, w01, w11 = w, splat(0.0), w
     if most_bend > 0.0:
         full, most = 4.0 * inverse_squared_sigma * square_root(w), most_bend / e
         bend = w * select(full < most, full, most)

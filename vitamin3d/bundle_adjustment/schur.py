@@ -19,7 +19,7 @@ from vitamin3d.bundle_adjustment.observations import Sightings, squared_errors
 from vitamin3d.bundle_adjustment.problem import BundleProblem
 from vitamin3d.bundle_adjustment.subspace import sweep_points
 from vitamin3d.bundle_adjustment.variables import Progress, Variables, free_slots, pinhole_model, sightings_of
-from vitamin3d.geometry.camera import Camera
+from vitamin3d.geometry.cameras import Camera
 from vitamin3d.types import Array, BundleReport
 
 FIRST_DAMPING = 1e-4

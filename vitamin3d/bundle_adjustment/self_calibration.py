@@ -15,7 +15,7 @@ from vitamin3d.bundle_adjustment.problem import BundleProblem
 from vitamin3d.bundle_adjustment.schur import LEAST_INFORMATION, ReducedSystem, Step, minimise
 from vitamin3d.bundle_adjustment.variables import Progress, Variables, free_slots, sightings_of
 from vitamin3d.errors import InputError
-from vitamin3d.geometry.camera import Camera
+from vitamin3d.geometry.cameras import Camera
 from vitamin3d.geometry.reprojection import fill_model_derivatives
 from vitamin3d.types import Array
 
@@ -72,7 +72,7 @@ def adjust_with_intrinsics(
     Raises:
         InputError: an unknown, doubled or contradictory name.
     """
-    basis, sightings = parameter_basis(free, camera.fy / camera.fx), sightings_of(problem, camera.distort(problem.obs_pixels))
+    basis, sightings = parameter_basis(free, aspect_of(camera)), sightings_of(problem, camera.distort(problem.obs_pixels))
     variables = Variables.of(problem, camera.model[None])
     noise_px = _noise(ReducedSystem(sightings, free_slots(problem), sigma_px).squared_errors(variables), problem, len(free), sigma_px)
     prior = np.array([(noise_px / priors[name]) ** 2 if priors and name in priors else 0.0 for name in free])
@@ -88,6 +88,11 @@ def adjust_with_intrinsics(
     pixels = refined.undistort(camera.distort(problem.obs_pixels))
     solved = dataclasses.replace(variables.written_to(problem), obs_pixels=pixels)
     return solved, refined, _report(system, variables, problem, refined, tuple(free), sigma_px, progress)
+
+
+def aspect_of(camera: Camera) -> float:
+    """Focal length down over that to the right."""
+    return camera.parameters["fy"] / camera.parameters["fx"]
 
 
 def parameter_basis(free: Sequence[str], aspect: float) -> Array:

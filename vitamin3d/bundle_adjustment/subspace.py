@@ -12,7 +12,7 @@ from typing import NamedTuple
 import numpy as np
 
 from vitamin3d._jit import kernel
-from vitamin3d._lanes import WIDTH, any_of, greatest, lanes, scatter, select, total
+from vitamin3d._simd import WIDTH, any_of, greatest, scatter, select, splat, total
 from vitamin3d.bundle_adjustment.normal_equations import (
     NormalEquations,
     accumulate,
@@ -43,9 +43,9 @@ from vitamin3d.bundle_adjustment.observations import (
 )
 from vitamin3d.bundle_adjustment.problem import BundleProblem
 from vitamin3d.bundle_adjustment.variables import Progress, Variables, free_slots, pinhole_model, sightings_of, squared_errors_of
-from vitamin3d.geometry.camera import Camera
+from vitamin3d.geometry.cameras import Camera
 from vitamin3d.geometry.cholesky import solve_6x6
-from vitamin3d.geometry.reprojection import in_camera, linearize_lanes, model_of, points_of, pose_of, retract
+from vitamin3d.geometry.reprojection import in_camera, linearize_simd, model_of, points_of, pose_of, retract
 from vitamin3d.types import Array, BundleReport
 
 BLOCK_DAMPING = 1e-9
@@ -91,7 +91,7 @@ def sweep_cameras(views, sightings, points, inverse_squared_sigma, scratch):  # 
         if slot[c] < 0 or last - first < MIN_OBSERVATIONS:
             continue
         pose, model = pose_of(R, t, c), model_of(models, c if models.shape[0] > 1 else 0)
-        block, costs = no_camera(), lanes(0.0)
+        block, costs = no_camera(), splat(0.0)
         for i in range(first, last, WIDTH):
             is_there, seen = linearize_rows(sightings, points, pose, model, is_distorted, i, last)
             is_seen, q, a, b, r0, r1, p00, p01, p10, p11 = seen
@@ -137,7 +137,7 @@ def solve_cameras(views, sightings, points, moved, inverse_squared_sigma, scratc
             _, is_there, X, Y, Z, u, v = camera_rows(sightings.camera_point, sightings.camera_pixels, points, i, last)
             _, _, X1, Y1, Z1, _, _ = camera_rows(sightings.camera_point, sightings.camera_pixels, moved, i, last)
             x, y, z = in_camera(pose, X, Y, Z)
-            is_seen, q, a, b, r0, r1, p00, p01, p10, p11 = linearize_lanes(x, y, z, is_distorted, model, u, v)
+            is_seen, q, a, b, r0, r1, p00, p01, p10, p11 = linearize_simd(x, y, z, is_distorted, model, u, v)
             _, _, g00, g01, g11, h0, h1, _, _, _ = information(is_there, is_seen, r0, r1, p00, p01, p10, p11, inverse_squared_sigma, 0.0)
             J, d0, d1, d2 = by_point(pose, q, a, b), X1 - X, Y1 - Y, Z1 - Z
             da, db = J[0] * d0 + J[1] * d1 + J[2] * d2, J[3] * d0 + J[4] * d1 + J[5] * d2
@@ -156,13 +156,13 @@ def sweep_points(views, sightings, points, inverse_squared_sigma):  # type: igno
     Returns the largest distance moved, the squared norm of the gradient, and the cost after the sweep.
     """
     is_distorted = models_are_distorted(views.models)
-    farthest, squared_gradient, cost = lanes(0.0), lanes(0.0), lanes(0.0)
+    farthest, squared_gradient, cost = splat(0.0), splat(0.0), splat(0.0)
     for start in range(0, points.shape[0], WIDTH):
         p, is_new, first, count, longest = point_group(sightings, start)
         if longest == 0:
             continue
         X, Y, Z = points_of(points, p)
-        block, before = no_point(), lanes(0.0)
+        block, before = no_point(), splat(0.0)
         for n in range(longest):
             is_there, _, pose, _, seen = linearize_sighting(views, sightings, is_distorted, X, Y, Z, first, count, n)
             is_seen, q, a, b, r0, r1, p00, p01, p10, p11 = seen
@@ -176,7 +176,7 @@ def sweep_points(views, sightings, points, inverse_squared_sigma):  # type: igno
         d0, d1, d2 = point_step(L, g0, g1, g2)
         best = before
         for _ in range(STEP_HALVINGS):
-            x, y, z, after = X - d0, Y - d1, Z - d2, lanes(0.0)
+            x, y, z, after = X - d0, Y - d1, Z - d2, splat(0.0)
             for n in range(longest):
                 is_there, e = squared_error_sighting(views, sightings, is_distorted, x, y, z, first, count, n)
                 after = after + robust_cost(is_there, e, inverse_squared_sigma)

@@ -8,7 +8,7 @@ import numpy as np
 
 from vitamin3d.bundle_adjustment.observations import Sightings, Views, longest_first, squared_errors
 from vitamin3d.bundle_adjustment.problem import BundleProblem
-from vitamin3d.geometry.camera import Camera
+from vitamin3d.geometry.cameras import Camera
 from vitamin3d.types import Array, BundleReport
 
 
@@ -61,7 +61,7 @@ def sightings_of(problem: BundleProblem, pixels: Array | None = None) -> Sightin
 
 def pinhole_model(camera: Camera) -> Array:
     """(1, 8): the camera as it sees ideal pixels."""
-    return np.array([[camera.fx, camera.fy, camera.cx, camera.cy, 0.0, 0.0, 0.0, 0.0]])
+    return np.array([[*camera.intrinsics, 0.0, 0.0, 0.0, 0.0]])
 
 
 def squared_errors_of(problem: BundleProblem, variables: Variables) -> Array:

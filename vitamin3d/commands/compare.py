@@ -7,8 +7,8 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
+from vitamin3d.commands.outliers import report_outliers
 from vitamin3d.commands.process import prepare
-from vitamin3d.commands.strays import say_strays
 
 if TYPE_CHECKING:
     from vitamin3d.datasets import Dataset
@@ -32,7 +32,7 @@ def compare(
     back: Annotated[float, typer.Option(help="The viewer steps back by so many median depths.")] = 0.3,
     up: Annotated[float, typer.Option(help="And up.")] = 0.2,
     right: Annotated[float, typer.Option(help="And to the right.")] = 0.0,
-    drop_strays: Annotated[bool, typer.Option("--drop-strays", help="Leave out points that are NaN or far from all others.")] = False,
+    drop_outliers: Annotated[bool, typer.Option("--drop-outliers", help="Leave out points that are NaN or far from all others.")] = False,
     out: Annotated[Path | None, typer.Option("--out", "-o", help="Folder for JSON, table and picture; default: RUN/comparison.")] = None,
     json: Annotated[bool, typer.Option("--json", help="Print JSON instead of the table.")] = False,
 ) -> None:
@@ -51,7 +51,7 @@ def compare(
     scan = None if reference is None else read_geometry_as("reference", reference)
     dataset = read_sequence(ground_truth, source, calibration)
     truth = read_truth(TruthRequest(ground_truth, source, calibration), dataset)
-    say_strays([*own, *items, *([scan] if scan else [])], drop_strays)
+    report_outliers([*own, *items, *([scan] if scan else [])], drop_outliers)
     surface = _reference(scan, source or ground_truth, dataset, truth)
     report, placed = compared(own, items, truth, surface)
     is_metric = truth is not None or bool(finished.stats["scale"]["known"])

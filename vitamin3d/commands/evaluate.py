@@ -7,8 +7,8 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
+from vitamin3d.commands.outliers import report_outliers
 from vitamin3d.commands.process import prepare
-from vitamin3d.commands.strays import say_strays
 from vitamin3d.errors import InputError
 
 if TYPE_CHECKING:
@@ -50,7 +50,7 @@ def evaluate(
     reference: Annotated[
         Path | None, typer.Option(help="Score mesh and cloud against this scanner's cloud or mesh (EuRoC's data.ply).")
     ] = None,
-    drop_strays: Annotated[bool, typer.Option("--drop-strays", help="Leave out points that are NaN or far from all others.")] = False,
+    drop_outliers: Annotated[bool, typer.Option("--drop-outliers", help="Leave out points that are NaN or far from all others.")] = False,
     out: Annotated[Path | None, typer.Option("--out", "-o", help="Folder for JSON, table and plots; default: RUN/evaluation.")] = None,
     json: Annotated[bool, typer.Option("--json", help="Print JSON instead of the table.")] = False,
 ) -> None:
@@ -71,7 +71,7 @@ def evaluate(
     offset_ns = _nanoseconds(time_offset)
     report = figures(finished, truth, dataset, offset_ns)
     if surface or reference is not None:
-        report["surface"] = _surface(finished, truth, dataset, source or ground_truth, reference, drop_strays)
+        report["surface"] = _surface(finished, truth, dataset, source or ground_truth, reference, drop_outliers)
     folder = out or (run / "evaluation" if run.is_dir() else None)
     typer.echo(as_json(report) if json else table(report), nl=not json)
     if folder is not None:
@@ -89,7 +89,7 @@ def _nanoseconds(offset_s: float) -> int:
 
 
 def _surface(
-    run: "Run", truth: "Truth | None", dataset: "Dataset | None", folder: Path | None, reference: Path | None, drop_strays: bool
+    run: "Run", truth: "Truth | None", dataset: "Dataset | None", folder: Path | None, reference: Path | None, drop_outliers: bool
 ) -> dict[str, Any]:
     from vitamin3d.evaluation.comparison import read_geometry_as, read_own
     from vitamin3d.evaluation.surface_report import surface_report
@@ -101,7 +101,7 @@ def _surface(
     if not run.path.is_dir():
         raise InputError(f"{run.path}: a surface needs the folder of a finished run, not a trajectory alone")
     own, scan = read_own(run.path), None if reference is None else read_geometry_as("reference", reference)
-    say_strays([*own, *([scan] if scan else [])], drop_strays)
+    report_outliers([*own, *([scan] if scan else [])], drop_outliers)
     report = surface_report(run, own, truth, dataset, folder, scan)
     if report is None:
         raise InputError(f"{folder}: no depth maps (depth0/, depth.txt, frame-*.depth.png); give --reference with a true cloud or mesh")

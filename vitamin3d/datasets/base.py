@@ -12,7 +12,7 @@ import numpy as np
 from vitamin3d.datasets.pictures import DEEP_SUFFIXES, Picture, Unreadable, picture_of, read_picture, read_pixels
 from vitamin3d.datasets.sixteen_bits import FULL_RANGE, largest_shown, white_level
 from vitamin3d.errors import InputError
-from vitamin3d.geometry.camera import Camera
+from vitamin3d.geometry.cameras import Camera
 from vitamin3d.types import Array, Frame, Trajectory
 
 SIZE_SAMPLES = 50

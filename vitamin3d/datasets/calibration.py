@@ -12,7 +12,7 @@ import yaml
 
 from vitamin3d.datasets.tables import Row, read_text, rows_of
 from vitamin3d.errors import InputError
-from vitamin3d.geometry.camera import Camera
+from vitamin3d.geometry.cameras import Camera, PinholeCamera
 from vitamin3d.types import Array
 
 DEFAULT_RATE_HZ = Fraction(30)
@@ -37,7 +37,7 @@ def read_calibration(path: Path) -> Calibration:
     fx, fy, cx, cy = _numbers(path, fields, "intrinsics", 4)
     width, height = _resolution(path, fields)
     k1, k2, p1, p2 = _numbers(path, fields, "distortion_coefficients", 4)
-    camera = Camera(fx, fy, cx, cy, width, height, (k1, k2, p1, p2), _readout(path, fields))
+    camera = PinholeCamera(fx, fy, cx, cy, width, height, (k1, k2, p1, p2), _readout(path, fields))
     check_camera(path, camera)
     return Calibration(camera, _rate(path, fields), _extrinsics(path, fields))
 
@@ -55,7 +55,7 @@ def read_kitti_calibration(path: Path, line_name: str, size: tuple[int, int]) ->
     raise InputError(f"{path}: no line `{line_name}:` with twelve numbers; use the calib.txt of this sequence, or give --calibration FILE")
 
 
-def check_camera(path: Path, camera: Camera) -> None:
+def check_camera(path: Path, camera: PinholeCamera) -> None:
     """InputError for a camera that cannot be meant."""
     fx, fy = camera.fx, camera.fy
     size = max(camera.width, camera.height)
@@ -69,7 +69,7 @@ def check_camera(path: Path, camera: Camera) -> None:
         raise _bad(path, "the distortion folds the picture onto itself; check distortion_coefficients: [k1, k2, p1, p2]")
 
 
-def _folds_early(camera: Camera) -> bool:
+def _folds_early(camera: PinholeCamera) -> bool:
     """True where the radial distortion stops growing within half of the picture's shorter side."""
     r2 = (0.25 * min(camera.width / camera.fx, camera.height / camera.fy)) ** 2
     k1, k2 = camera.distortion[:2]
@@ -168,6 +168,6 @@ def _kitti_camera(row: Row, size: tuple[int, int]) -> Camera:
     if len(numbers) != 12:
         raise row.fail(f"expected twelve numbers, found {len(numbers)}")
     P = np.reshape(numbers, (3, 4))
-    camera = Camera(float(P[0, 0]), float(P[1, 1]), float(P[0, 2]), float(P[1, 2]), *size)
+    camera = PinholeCamera(float(P[0, 0]), float(P[1, 1]), float(P[0, 2]), float(P[1, 2]), *size)
     check_camera(row.path, camera)
     return camera

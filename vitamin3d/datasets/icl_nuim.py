@@ -11,10 +11,10 @@ from vitamin3d.datasets.calibration import read_calibration
 from vitamin3d.datasets.image_folder import pictures_in
 from vitamin3d.datasets.tables import regular_timestamps, rows_of
 from vitamin3d.datasets.trajectories import read_tum
-from vitamin3d.geometry.camera import Camera
+from vitamin3d.geometry.cameras import PinholeCamera
 from vitamin3d.types import Trajectory
 
-NOMINAL = Camera(481.2, 480.0, 319.5, 239.5, 640, 480)
+NOMINAL = PinholeCamera(481.2, 480.0, 319.5, 239.5, 640, 480)
 RATE_HZ = Fraction(30)
 MIRROR = np.diag([1.0, -1.0, 1.0, 1.0])
 """The data's camera has fy = -480, y up: a left-handed frame. Ours has y down; the truth is mirrored to match."""

@@ -10,7 +10,7 @@ from vitamin3d.datasets.tables import check_ascending, row_seconds, rows_of
 from vitamin3d.datasets.trajectories import read_kitti_poses
 from vitamin3d.datasets.tum import tum_truth
 from vitamin3d.errors import InputError
-from vitamin3d.geometry.camera import Camera
+from vitamin3d.geometry.cameras import Camera
 from vitamin3d.types import Trajectory
 
 PROJECTIONS = {"image_0": "P0", "image_2": "P2"}

@@ -18,9 +18,9 @@ PLY_TYPES = {
 }  # fmt: skip
 PLY_ORDERS = {"binary_little_endian": "<", "binary_big_endian": ">", "ascii": ""}
 FAR = 30.0
-"""A point farther from the middle than this many times the 90th percentile of all is a stray one."""
-MOST_STRAYS = 0.02
-"""Above this share far points are no strays: the cloud has that shape."""
+"""A point farther from the middle than this many times the 90th percentile of all is an outlier."""
+MOST_OUTLIERS = 0.02
+"""Above this share far points are no outliers: the cloud has that shape."""
 
 
 @dataclass(frozen=True)
@@ -33,7 +33,7 @@ class Geometry:
     """(F, 3) int64; none: a cloud."""
     colors: Array | None = None
     """(N, 3) uint8 RGB."""
-    strays: int = 0
+    outliers: int = 0
     """Points of the file that are left out: not finite, or far from everything else."""
 
     @property
@@ -42,7 +42,7 @@ class Geometry:
 
 
 def read_geometry(path: Path) -> Geometry:
-    """A cloud or mesh without its stray points.
+    """A cloud or mesh without its outlying points.
 
     Raises:
         InputError: the file cannot be read, is of another kind, cut short, or holds no finite point.
@@ -60,10 +60,10 @@ def read_geometry(path: Path) -> Geometry:
         raise InputError(f"{path}: damaged or cut short; export it again") from None
     if len(read.points) == 0:
         raise InputError(f"{path}: an empty cloud; give a file with points")
-    return without_strays(read, path)
+    return without_outliers(read, path)
 
 
-def without_strays(geometry: Geometry, path: Path) -> Geometry:
+def without_outliers(geometry: Geometry, path: Path) -> Geometry:
     """The geometry less what is not finite and points far from all others: one point at 2 km hides a room."""
     finite: Array = np.asarray(np.isfinite(geometry.points).all(axis=1))
     if finite.sum() < 3:
@@ -74,7 +74,7 @@ def without_strays(geometry: Geometry, path: Path) -> Geometry:
         raise InputError(f"{path}: all points are the same; was it exported with a scale of zero?")
     distance = np.linalg.norm(geometry.points - np.median(geometry.points[finite], axis=0), axis=1)
     far = finite & (distance > FAR * max(float(np.percentile(distance[finite], 90)), 1e-12))
-    keep: Array = finite & ~far if far.sum() <= MOST_STRAYS * finite.sum() else finite
+    keep: Array = finite & ~far if far.sum() <= MOST_OUTLIERS * finite.sum() else finite
     return geometry if keep.all() else _kept(geometry, keep)
 
 

@@ -10,10 +10,10 @@ from vitamin3d.datasets.base import Listing, PictureSequence
 from vitamin3d.datasets.calibration import DEFAULT_RATE_HZ, read_calibration
 from vitamin3d.datasets.tables import regular_timestamps, rows_of
 from vitamin3d.errors import InputError
-from vitamin3d.geometry.camera import Camera
+from vitamin3d.geometry.cameras import PinholeCamera
 from vitamin3d.types import Array, Trajectory
 
-NOMINAL = Camera(585.0, 585.0, 320.0, 240.0, 640, 480)
+NOMINAL = PinholeCamera(585.0, 585.0, 320.0, 240.0, 640, 480)
 """What the authors of the data give, for colour and depth alike."""
 COLOR = "frame-*.color.*"
 

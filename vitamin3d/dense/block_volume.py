@@ -5,7 +5,7 @@ import numpy as np
 
 from vitamin3d._jit import inlined, kernel
 from vitamin3d.dense.marching_cubes import EMPTY, SIDE, VOXELS, Blocks, zero_level
-from vitamin3d.geometry.camera import Camera
+from vitamin3d.geometry.cameras import Camera
 from vitamin3d.geometry.se3 import inverse
 from vitamin3d.types import Array, DepthView
 
@@ -180,7 +180,7 @@ def _integrate(depth, pixel_weights, color, camera, R, t, voxel, truncation, max
 
 def pixel_camera(canvas: Camera) -> Array:
     """(4,) float32: focal lengths, and the centre moved by half a pixel, so that rounding down gives the pixel of a projection."""
-    return np.array([canvas.fx, canvas.fy, canvas.cx + 0.5, canvas.cy + 0.5], np.float32)
+    return np.asarray(canvas.intrinsics + np.array([0.0, 0.0, 0.5, 0.5]), np.float32)
 
 
 class BlockVolume:

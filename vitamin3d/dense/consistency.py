@@ -6,7 +6,7 @@ from dataclasses import replace
 import numpy as np
 
 from vitamin3d._jit import inlined, kernel
-from vitamin3d.geometry.camera import Camera
+from vitamin3d.geometry.cameras import Camera
 from vitamin3d.geometry.se3 import inverse
 from vitamin3d.types import Array, DepthView
 

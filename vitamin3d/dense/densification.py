@@ -13,11 +13,11 @@ from functools import cached_property
 import numpy as np
 
 from vitamin3d._jit import inlined, kernel
-from vitamin3d._lanes import WIDE, load_singles, singles, store, total_single
+from vitamin3d._simd import WIDE, load_f32, splat_f32, store, total_f32
 from vitamin3d.config import DensificationConfig
 from vitamin3d.dense.plane_sweep import PlaneSweep, SweptDepth, turned
 from vitamin3d.dense.view_graph import Neighbourhood
-from vitamin3d.geometry.camera import Camera
+from vitamin3d.geometry.cameras import Camera
 from vitamin3d.geometry.se3 import inverse
 from vitamin3d.types import Array, Frame, MapSnapshot
 
@@ -75,17 +75,17 @@ def _mask_and_reduce(image, is_outside, masked, reduced):  # type: ignore[no-unt
 def _centered_patch(image, first, width, side, mask, patch):  # type: ignore[no-untyped-def]
     """Writes the grey levels around a pixel without their mean into `patch`, rows filled up to sixteens; their power."""
     filled, size = mask.shape[0], np.float32(side * side)
-    added = singles(np.float32(0.0))
+    added = splat_f32(np.float32(0.0))
     for x in range(0, filled, WIDE):
         for y in range(side):
-            added += load_singles(image, first + y * width + x) * load_singles(mask, x)
-    mean, powers = total_single(added) / size, singles(np.float32(0.0))
+            added += load_f32(image, first + y * width + x) * load_f32(mask, x)
+    mean, powers = total_f32(added) / size, splat_f32(np.float32(0.0))
     for x in range(0, filled, WIDE):
         for y in range(side):
-            centered = (load_singles(image, first + y * width + x) - mean) * load_singles(mask, x)
+            centered = (load_f32(image, first + y * width + x) - mean) * load_f32(mask, x)
             store(patch, y * filled + x, centered)
             powers += centered * centered
-    return total_single(powers)
+    return total_f32(powers)
 
 
 @inlined
@@ -93,20 +93,20 @@ def _zncc(patch, power, source, first, width, side, mask, p, q):  # type: ignore
     """ZNCC of a centred patch with the source's, whose first pixel lies (p, q) after `first`; linear between pixels."""
     filled, size, one = mask.shape[0], np.float32(side * side), np.float32(1.0)
     near = np.float32(source[first + (side // 2) * (width + 1)])  # what is subtracted keeps sums of squares small, and exact
-    added, powers, products = singles(np.float32(0.0)), singles(np.float32(0.0)), singles(np.float32(0.0))
+    added, powers, products = splat_f32(np.float32(0.0)), splat_f32(np.float32(0.0)), splat_f32(np.float32(0.0))
     for x in range(0, filled, WIDE):
-        inside, at = load_singles(mask, x), first + x
-        upper = (one - p) * load_singles(source, at) + p * load_singles(source, at + 1)
+        inside, at = load_f32(mask, x), first + x
+        upper = (one - p) * load_f32(source, at) + p * load_f32(source, at + 1)
         for y in range(side):
             at += width
-            lower = (one - p) * load_singles(source, at) + p * load_singles(source, at + 1)
+            lower = (one - p) * load_f32(source, at) + p * load_f32(source, at + 1)
             other = ((one - q) * upper + q * lower - near) * inside
             added += other
             powers += other * other
-            products += other * load_singles(patch, y * filled + x)
+            products += other * load_f32(patch, y * filled + x)
             upper = lower
-    summed = total_single(added)
-    return total_single(products) / np.sqrt(power * (total_single(powers) - summed * summed / size + np.float32(1e-3)))
+    summed = total_f32(added)
+    return total_f32(products) / np.sqrt(power * (total_f32(powers) - summed * summed / size + np.float32(1e-3)))
 
 
 @kernel
@@ -182,7 +182,7 @@ class Densifier:
 
     def __init__(self, camera: Camera, canvas: Camera, config: DensificationConfig) -> None:
         self.camera, self.canvas, self.config = camera, canvas, config
-        self.reduced = replace(canvas.scaled(1 / REDUCTION), width=canvas.width // REDUCTION, height=canvas.height // REDUCTION)
+        self.reduced = canvas.scaled(1 / REDUCTION).cropped(canvas.width // REDUCTION, canvas.height // REDUCTION)
         self._sweep: PlaneSweep | None = None
 
     def densify(self, around: Neighbourhood[CanvasPicture]) -> MapSnapshot:
@@ -267,8 +267,9 @@ class Densifier:
     def _pixels_per_relative_depth(self, pixels: Array, inverse_depths: Array, motions: Array) -> Array:
         """(N, S) by how many pixels a point moves in each source when its inverse depth grows by its own size."""
         x, y, _ = self.canvas.rays_from_ideal(pixels).T
-        u = self.canvas.fx * (motions[None, :, 0] - x[:, None] * motions[None, :, 2])
-        v = self.canvas.fy * (motions[None, :, 1] - y[:, None] * motions[None, :, 2])
+        fx, fy = self.canvas.intrinsics[:2]
+        u = fx * (motions[None, :, 0] - x[:, None] * motions[None, :, 2])
+        v = fy * (motions[None, :, 1] - y[:, None] * motions[None, :, 2])
         return np.asarray(inverse_depths[:, None] * np.hypot(u, v) / (1.0 + inverse_depths[:, None] * motions[None, :, 2]) ** 2)
 
     def _joined(self, snapshot: MapSnapshot, pixels: Array, inverse_depths: Array, deviations: Array) -> MapSnapshot:

@@ -6,7 +6,7 @@ import numpy as np
 
 from vitamin3d._jit import inlined, kernel
 from vitamin3d.config import DepthRenderingConfig
-from vitamin3d.geometry.camera import Camera
+from vitamin3d.geometry.cameras import Camera
 from vitamin3d.types import Array, DepthView, Frame, ImageMesh, MapSnapshot
 
 
@@ -30,7 +30,7 @@ class DepthRenderer:
     def render(self, snapshot: MapSnapshot, mesh: ImageMesh, slopes: Array) -> DepthView:
         """Depth, normals and colour of a keyframe; `slopes` (V, 2) is the gradient of inverse depth, per pixel of the camera."""
         kept = mesh.triangles[is_surface(mesh, self.camera, self.config)]
-        per_canvas_pixel = slopes * [self.camera.fx / self.canvas.fx, self.camera.fy / self.canvas.fy]
+        per_canvas_pixel = slopes * (self.camera.intrinsics[:2] / self.canvas.intrinsics[:2])
         layers = np.column_stack([mesh.inverse_depth, per_canvas_pixel, mesh.relative_deviation])
         drawn = rasterize(self.camera.ideal_in(self.canvas, mesh.pixels), kept, layers, self.canvas.width, self.canvas.height)
         drawn[self.is_outside, 0] = 0.0

@@ -11,7 +11,7 @@ import numpy as np
 
 from vitamin3d._jit import kernel
 from vitamin3d.config import ExtrapolationConfig
-from vitamin3d.geometry.camera import Camera
+from vitamin3d.geometry.cameras import Camera
 from vitamin3d.geometry.planar_delaunay import delaunay
 from vitamin3d.types import Array, ImageMesh
 

@@ -12,7 +12,7 @@ import numpy as np
 from vitamin3d._jit import kernel
 from vitamin3d.config import PhotometricConfig
 from vitamin3d.dense.depth_rendering import DepthRenderer, rasterize
-from vitamin3d.geometry.camera import Camera
+from vitamin3d.geometry.cameras import Camera
 from vitamin3d.geometry.se3 import inverse
 from vitamin3d.types import Array, DepthView, ImageMesh
 

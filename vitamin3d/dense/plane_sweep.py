@@ -11,10 +11,10 @@ import cv2
 import numpy as np
 
 from vitamin3d._jit import inlined, kernel
-from vitamin3d._lanes import WIDE, counting_shorts, least, lesser, load_shorts, shorts, store, where_below
+from vitamin3d._simd import WIDE, counting_i16, least, lesser, load_i16, splat_i16, store, where_below
 from vitamin3d.config import DensificationConfig
 from vitamin3d.errors import InputError
-from vitamin3d.geometry.camera import Camera
+from vitamin3d.geometry.cameras import Camera
 from vitamin3d.types import Array
 
 HALF_WIDTH, HALF_HEIGHT = 4, 3
@@ -125,13 +125,13 @@ def _step(lines, before, cost, at, ceiling, lowest, small, large, total, after):
 
     `before` and `after` are where the pixels' costs lie in `lines`, between two infinite ones, `at` where in `cost` and `total`.
     """
-    smallest = shorts(INFINITE)
+    smallest = splat_i16(INFINITE)
     for d in range(0, ceiling.shape[0], WIDE):
-        beside = lesser(load_shorts(lines, before + d - 1), load_shorts(lines, before + d + 1)) + small
-        best = lesser(lesser(load_shorts(lines, before + d), beside), lowest + large)
-        value = load_shorts(cost, at + d) + best - lowest + load_shorts(ceiling, d)
+        beside = lesser(load_i16(lines, before + d - 1), load_i16(lines, before + d + 1)) + small
+        best = lesser(lesser(load_i16(lines, before + d), beside), lowest + large)
+        value = load_i16(cost, at + d) + best - lowest + load_i16(ceiling, d)
         store(lines, after + d, value)
-        store(total, at + d, load_shorts(total, at + d) + value)
+        store(total, at + d, load_i16(total, at + d) + value)
         smallest = lesser(smallest, value)
     return least(smallest)
 
@@ -187,13 +187,13 @@ def _aggregate(cost, image, small, penalties, ceiling, total):  # type: ignore[n
 @inlined
 def _first_least(total, at, planes):  # type: ignore[no-untyped-def]
     """The first plane of the lowest total, and that."""
-    smallest = shorts(INFINITE)
+    smallest = splat_i16(INFINITE)
     for d in range(0, planes, WIDE):
-        smallest = lesser(smallest, load_shorts(total, at + d))
+        smallest = lesser(smallest, load_i16(total, at + d))
     lowest = least(smallest)
-    places = shorts(INFINITE)
+    places = splat_i16(INFINITE)
     for d in range(0, planes, WIDE):
-        places = lesser(places, where_below(lowest, load_shorts(total, at + d), INFINITE, counting_shorts(d)))
+        places = lesser(places, where_below(lowest, load_i16(total, at + d), INFINITE, counting_i16(d)))
     return least(places), lowest
 
 
@@ -205,9 +205,9 @@ def _choose(total, cost, planes, first, step, inverse_depth, distinctness, winne
         for u in range(width):
             at = (v * width + u) * filled
             k, lowest = _first_least(total, at, filled)
-            others = shorts(INFINITE)
+            others = splat_i16(INFINITE)
             for d in range(0, filled, WIDE):
-                here, plane = load_shorts(total, at + d), counting_shorts(d)
+                here, plane = load_i16(total, at + d), counting_i16(d)
                 others = lesser(others, where_below(plane, k - 2, here, where_below(k + 2, plane, here, INFINITE)))
             distinctness[v, u] = np.float32(least(others)) / max(np.float32(lowest), np.float32(1e-3))
             winner_cost[v, u] = np.float32(0.5) * np.float32(cost[v, u, k])
@@ -263,7 +263,8 @@ class PlaneSweep:
         with np.errstate(divide="ignore", over="ignore"):
             scale = 1.0 / np.maximum(1.0 + motions[:, 2:] * inverse_depths, 1e-6)
         ends = []
-        for k, (focal, center, count) in enumerate(((camera.fx, camera.cx, camera.width), (camera.fy, camera.cy, camera.height))):
+        fx, fy, cx, cy = camera.intrinsics
+        for k, (focal, center, count) in enumerate(((fx, cx, camera.width), (fy, cy, camera.height))):
             moved = focal * motions[:, k : k + 1] * inverse_depths * scale + center
             at = np.floor((np.arange(count) - center) * scale[..., None] + moved[..., None] + 0.5)
             ends.append(np.where((at >= 0) & (at < count), at, count).astype(np.uint16))

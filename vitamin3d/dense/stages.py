@@ -18,7 +18,7 @@ from vitamin3d.dense.nltgv import denoise
 from vitamin3d.dense.photometric_check import marked, photometrically_checked
 from vitamin3d.dense.view_graph import Neighbourhood, ViewGraph
 from vitamin3d.dense.view_selection import ViewSelection, view_stride
-from vitamin3d.geometry.camera import Camera
+from vitamin3d.geometry.cameras import Camera
 from vitamin3d.steps import Stage
 from vitamin3d.types import DepthView, MapSnapshot, NewestFrame, StepTimes
 

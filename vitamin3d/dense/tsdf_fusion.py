@@ -10,7 +10,7 @@ import numpy as np
 from vitamin3d._jit import kernel
 from vitamin3d.dense.block_volume import BlockVolume
 from vitamin3d.errors import DependencyError, InputError
-from vitamin3d.geometry.camera import Camera
+from vitamin3d.geometry.cameras import Camera, PinholeCamera
 from vitamin3d.types import Array, DepthView, Surface
 
 BLOCK_RESOLUTION = 16
@@ -111,7 +111,7 @@ class _ScalableVolume:
         rgbd = o3d.geometry.RGBDImage()
         rgbd.color = o3d.geometry.Image(np.ascontiguousarray(view.color))
         rgbd.depth = o3d.geometry.Image(certain_depth(view, self._limits.relative_deviation, max_depth))
-        pinhole = o3d.camera.PinholeCameraIntrinsic(canvas.width, canvas.height, canvas.fx, canvas.fy, canvas.cx, canvas.cy)
+        pinhole = o3d.camera.PinholeCameraIntrinsic(canvas.width, canvas.height, *canvas.intrinsics)
         self._volume.integrate(rgbd, pinhole, view.T_cam_world)
 
     def size(self) -> dict[str, int] | None:
@@ -178,7 +178,7 @@ def check_backend(backend: str) -> None:
     Raises:
         DependencyError: the plane does not come back.
     """
-    canvas = Camera(40.0, 40.0, 19.5, 19.5, 40, 40)
+    canvas = PinholeCamera(40.0, 40.0, 19.5, 19.5, 40, 40)
     depth, normals, color = np.ones((40, 40), np.float32), np.zeros((40, 40, 3), np.float32), np.full((40, 40, 3), 128, np.uint8)
     volume = BACKENDS[backend](0.04, 0.16, Limits(10.0, 10.0))
     volume.integrate(DepthView(0, np.eye(4), depth, normals, color, np.ones_like(depth)), canvas, 2.0)

@@ -4,7 +4,7 @@
 import numpy as np
 
 from vitamin3d.config import DensificationConfig
-from vitamin3d.geometry.camera import Camera
+from vitamin3d.geometry.cameras import Camera
 from vitamin3d.geometry.se3 import inverse, transform_points
 from vitamin3d.types import Array, MapSnapshot
 

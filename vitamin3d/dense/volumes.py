@@ -10,7 +10,7 @@ from vitamin3d.config import Config
 from vitamin3d.dense.surface_extraction import clean
 from vitamin3d.dense.tsdf_fusion import Limits, TsdfVolume, empty_surface
 from vitamin3d.dense.view_store import Packed, ViewStore, packed
-from vitamin3d.geometry.camera import Camera
+from vitamin3d.geometry.cameras import Camera
 from vitamin3d.geometry.se3 import inverse
 from vitamin3d.steps import Volume
 from vitamin3d.types import Array, DepthView, StepTimes, Surface

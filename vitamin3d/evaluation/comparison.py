@@ -194,7 +194,7 @@ def _measured(placed: Placed, ours: Array, reference: Array | None, is_own: bool
         "kind": "mesh" if item.geometry.is_mesh else "cloud",
         "points": len(item.geometry.points),
         "triangles": len(item.geometry.triangles),
-        "strays": item.geometry.strays,
+        "outliers": item.geometry.outliers,
         "placed_by": placement.how,
         "scale": placement.scale,
         **placement.figures,

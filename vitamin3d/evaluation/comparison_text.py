@@ -11,11 +11,11 @@ from vitamin3d.datasets.trajectories import read_tum
 from vitamin3d.evaluation.comparison import Placed
 from vitamin3d.exporters.normal_map import NormalCaster
 from vitamin3d.exporters.rendering import draw, draw_points, reduced, side_by_side, stepped_aside, viewer
-from vitamin3d.geometry.camera import Camera
+from vitamin3d.geometry.cameras import Camera, PinholeCamera
 from vitamin3d.geometry.se3 import inverse, transform_points
 from vitamin3d.types import Array, Surface
 
-DEFAULT_CAMERA = Camera(500.0, 500.0, 319.5, 239.5, 640, 480)
+DEFAULT_CAMERA = PinholeCamera(500.0, 500.0, 319.5, 239.5, 640, 480)
 PANEL_WIDTH, SUPERSAMPLING = 420, 2
 HOW = {"itself": "–", "trajectory": "trajectory", "registration": "shape", "none": "not found"}
 
@@ -77,8 +77,8 @@ def _notes(report: dict[str, Any], has_truth: bool) -> list[str]:
     lines = [
         f"Unit: {report['unit']}; world: {report['world']}. Coverage: shares of {share}. Ours for coverage and distances: {report['ours']}."
     ]
-    strays = [f"{item['name']}: {item['strays']}" for item in report["items"] if item["strays"]]
-    lines += [f"Stray points left out (not finite, or far from everything else): {', '.join(strays)}."] if strays else []
+    outliers = [f"{item['name']}: {item['outliers']}" for item in report["items"] if item["outliers"]]
+    lines += [f"Outlying points left out (not finite, or far from everything else): {', '.join(outliers)}."] if outliers else []
     lost = [f"{i['name']} (overlap {i['overlap']:.2f})" for i in report["items"] if i["placed_by"] == "none"]
     return lines + ([f"No registration was found for {', '.join(lost)}: neither its scale nor its frame is known."] if lost else [])
 

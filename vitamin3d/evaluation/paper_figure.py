@@ -17,7 +17,7 @@ from vitamin3d.evaluation.finished_run import read_run
 from vitamin3d.exporters.mesh import read_ply
 from vitamin3d.exporters.normal_map import NormalCaster
 from vitamin3d.exporters.rendering import draw, draw_points, reduced, side_by_side, stepped_aside, viewer
-from vitamin3d.geometry.camera import Camera
+from vitamin3d.geometry.cameras import Camera
 from vitamin3d.geometry.se3 import inverse
 from vitamin3d.types import Array
 

@@ -14,7 +14,7 @@ from vitamin3d.datasets.point_files import Geometry
 from vitamin3d.datasets.tables import nanoseconds_from_seconds, rows_of
 from vitamin3d.errors import InputError
 from vitamin3d.evaluation.surface_error import sample_surface
-from vitamin3d.geometry.camera import Camera
+from vitamin3d.geometry.cameras import Camera
 from vitamin3d.geometry.se3 import inverse, transform_points
 from vitamin3d.scale import MATCH_TOLERANCE_NS, match_timestamps
 from vitamin3d.types import Array, Trajectory

@@ -9,7 +9,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from vitamin3d.geometry.camera import Camera
+from vitamin3d.geometry.cameras import Camera
 from vitamin3d.geometry.epipolar_refinement import sampson_distances
 from vitamin3d.geometry.se3 import inverse, skew
 from vitamin3d.scale import match_timestamps

@@ -7,7 +7,7 @@ import numpy as np
 
 from vitamin3d._jit import kernel
 from vitamin3d.exporters.depth_map import write_png
-from vitamin3d.geometry.camera import Camera
+from vitamin3d.geometry.cameras import Camera
 from vitamin3d.types import Array, Surface
 
 RED_GREEN_BLUE = np.array([1.0, -1.0, -1.0])

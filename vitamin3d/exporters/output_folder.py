@@ -17,7 +17,7 @@ from vitamin3d.exporters.files import write_file
 from vitamin3d.exporters.mesh import write_cloud_ply, write_obj, write_ply
 from vitamin3d.exporters.normal_map import write_normal_map
 from vitamin3d.exporters.trajectory import write_tum
-from vitamin3d.geometry.camera import Camera
+from vitamin3d.geometry.cameras import Camera
 from vitamin3d.scale import Scale
 from vitamin3d.timestamps import seconds_from_nanoseconds
 from vitamin3d.types import Array, DepthView, PointCloud, Surface, Trajectory
@@ -54,9 +54,10 @@ def _program() -> str:
 
 def _camera_yaml(camera: Camera) -> str:
     """The fields of EuRoC's `sensor.yaml`."""
+    numbers = list(camera.parameters.values())
     return (
-        f"camera_model: pinhole\nintrinsics: [{camera.fx!r}, {camera.fy!r}, {camera.cx!r}, {camera.cy!r}]\n"
-        f"distortion_model: radial-tangential\ndistortion_coefficients: {list(camera.distortion)!r}\n"
+        f"camera_model: pinhole\nintrinsics: {numbers[:4]!r}\n"
+        f"distortion_model: radial-tangential\ndistortion_coefficients: {numbers[4:]!r}\n"
         f"resolution: [{camera.width}, {camera.height}]\n{f'readout_s: {camera.readout_s!r}' + chr(10) if camera.readout_s else ''}"
     )
 

@@ -8,7 +8,7 @@ import numpy as np
 
 from vitamin3d.errors import OutputError
 from vitamin3d.exporters.normal_map import NormalCaster, rgb_from_normals
-from vitamin3d.geometry.camera import Camera
+from vitamin3d.geometry.cameras import Camera
 from vitamin3d.geometry.se3 import transform_points
 from vitamin3d.types import Array
 

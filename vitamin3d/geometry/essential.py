@@ -4,7 +4,7 @@
 import cv2
 import numpy as np
 
-from vitamin3d.geometry.camera import Camera
+from vitamin3d.geometry.cameras import Camera
 from vitamin3d.geometry.epipolar_refinement import refine_essential, sampson_distances
 from vitamin3d.geometry.triangulation import triangulate
 from vitamin3d.types import Array, TwoView
@@ -29,7 +29,7 @@ def relative_pose(pixels_0: Array, pixels_1: Array, camera: Camera, threshold_px
         return None
     first = _in_front(E, mask.ravel() > 0, pixels_0, pixels_1, camera)
     rays_0, rays_1 = camera.rays_from_ideal(pixels_0), camera.rays_from_ideal(pixels_1)
-    threshold = threshold_px / camera.fx
+    threshold = camera.radians(threshold_px)
     E = refine_essential(first.T_1_0[:3, :3], first.T_1_0[:3, 3], rays_0, rays_1, threshold)
     return _in_front(E, np.abs(sampson_distances(E, rays_0, rays_1)) < threshold, pixels_0, pixels_1, camera)
 

@@ -4,7 +4,7 @@
 import cv2
 import numpy as np
 
-from vitamin3d.geometry.camera import Camera
+from vitamin3d.geometry.cameras import Camera
 from vitamin3d.types import Array
 
 

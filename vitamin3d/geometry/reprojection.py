@@ -7,8 +7,8 @@ Residual r = projection(T_cam_world X) - u, pixels. The pose moves by `exp_se3([
 import numpy as np
 
 from vitamin3d._jit import inlined, kernel
-from vitamin3d._lanes import gather, lanes, select
-from vitamin3d.geometry.camera import distort
+from vitamin3d._simd import gather, select, splat
+from vitamin3d.geometry.cameras.pinhole import distort
 from vitamin3d.types import Array
 
 MIN_DEPTH = 1e-6
@@ -49,7 +49,7 @@ def pose_of(R, t, c):  # type: ignore[no-untyped-def]
 
 @inlined
 def poses_of(R, t, c):  # type: ignore[no-untyped-def]
-    """`pose_of` for `Indices` c."""
+    """`pose_of` for `Int64x8` c."""
     r, s = 9 * c, 3 * c
     return (
         gather(R, r), gather(R, r + 1), gather(R, r + 2), gather(R, r + 3), gather(R, r + 4), gather(R, r + 5),
@@ -61,14 +61,14 @@ def poses_of(R, t, c):  # type: ignore[no-untyped-def]
 def model_of(models, m):  # type: ignore[no-untyped-def]
     """fx fy cx cy k1 k2 p1 p2 of model m of models (.., 8), each eight times."""
     return (
-        lanes(models[m, 0]), lanes(models[m, 1]), lanes(models[m, 2]), lanes(models[m, 3]), lanes(models[m, 4]), lanes(models[m, 5]),
-        lanes(models[m, 6]), lanes(models[m, 7]),
+        splat(models[m, 0]), splat(models[m, 1]), splat(models[m, 2]), splat(models[m, 3]), splat(models[m, 4]), splat(models[m, 5]),
+        splat(models[m, 6]), splat(models[m, 7]),
     )  # fmt: skip
 
 
 @inlined
 def models_of(models, c):  # type: ignore[no-untyped-def]
-    """`model_of` for `Indices` c."""
+    """`model_of` for `Int64x8` c."""
     m = 8 * c
     return (
         gather(models, m), gather(models, m + 1), gather(models, m + 2), gather(models, m + 3), gather(models, m + 4),
@@ -78,7 +78,7 @@ def models_of(models, c):  # type: ignore[no-untyped-def]
 
 @inlined
 def points_of(points, p):  # type: ignore[no-untyped-def]
-    """x, y, z of points (.., 3) for `Indices` p; pixels (.., 2) are read likewise."""
+    """x, y, z of points (.., 3) for `Int64x8` p; pixels (.., 2) are read likewise."""
     return gather(points, 3 * p), gather(points, 3 * p + 1), gather(points, 3 * p + 2)
 
 
@@ -91,7 +91,7 @@ def in_camera(pose, X, Y, Z):  # type: ignore[no-untyped-def]
 
 
 @inlined
-def linearize_lanes(x, y, z, is_distorted, model, u, v):  # type: ignore[no-untyped-def]
+def linearize_simd(x, y, z, is_distorted, model, u, v):  # type: ignore[no-untyped-def]
     """The residual and its derivatives in few numbers, eight at a time: is_seen, q, a, b, r0, r1, p00, p01, p10, p11.
 
     (a, b, 1) / q is the point in the camera frame, q = a = b = 0 behind the camera; r the residual to the pixel (u, v),
@@ -104,7 +104,7 @@ def linearize_lanes(x, y, z, is_distorted, model, u, v):  # type: ignore[no-unty
     q = select(is_seen, 1.0 / z, 0.0)
     a, b = select(is_seen, x * q, 0.0), select(is_seen, y * q, 0.0)
     if not is_distorted:
-        return is_seen, q, a, b, fx * a + cx - u, fy * b + cy - v, fx, lanes(0.0), lanes(0.0), fy
+        return is_seen, q, a, b, fx * a + cx - u, fy * b + cy - v, fx, splat(0.0), splat(0.0), fy
     xd, yd = distort(a, b, k1, k2, p1, p2)
     r2 = a * a + b * b
     radial, slope = 1.0 + r2 * (k1 + r2 * k2), 2.0 * k1 + 4.0 * k2 * r2
@@ -114,8 +114,8 @@ def linearize_lanes(x, y, z, is_distorted, model, u, v):  # type: ignore[no-unty
 
 
 @inlined
-def squared_error_lanes(x, y, z, is_distorted, model, u, v):  # type: ignore[no-untyped-def]
-    """|r|² of `linearize_lanes` in pixels², infinite behind the camera."""
+def squared_error_simd(x, y, z, is_distorted, model, u, v):  # type: ignore[no-untyped-def]
+    """|r|² of `linearize_simd` in pixels², infinite behind the camera."""
     fx, fy, cx, cy, k1, k2, p1, p2 = model
     q = 1.0 / z
     a, b = x * q, y * q

@@ -12,7 +12,7 @@ import cv2
 import numpy as np
 
 from vitamin3d._jit import kernel
-from vitamin3d.geometry.camera import Camera
+from vitamin3d.geometry.cameras import Camera
 from vitamin3d.geometry.cholesky import solve_6x6
 from vitamin3d.types import Array, Frame
 

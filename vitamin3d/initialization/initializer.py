@@ -7,7 +7,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from vitamin3d.config import Config
-from vitamin3d.geometry.camera import Camera
+from vitamin3d.geometry.cameras import Camera
 from vitamin3d.initialization.initialization_history import InitializationHistory
 from vitamin3d.initialization.map_initialization import build_first_map
 from vitamin3d.initialization.two_view_initialization import initialize_from_two_views

@@ -8,7 +8,7 @@ import numpy as np
 from vitamin3d.bundle_adjustment.schur import adjust_schur
 from vitamin3d.bundle_adjustment.variables import squared_reprojection_errors
 from vitamin3d.config import Config
-from vitamin3d.geometry.camera import Camera
+from vitamin3d.geometry.cameras import Camera
 from vitamin3d.initialization.two_view_initialization import median_motion
 from vitamin3d.localization.p3p_localization import localize
 from vitamin3d.mapping.keyframe_views import add_view

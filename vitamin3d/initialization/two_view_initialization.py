@@ -9,7 +9,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from vitamin3d.config import InitializationConfig
-from vitamin3d.geometry.camera import Camera
+from vitamin3d.geometry.cameras import Camera
 from vitamin3d.geometry.essential import relative_pose
 from vitamin3d.geometry.rotation_fit import fit_rotation, turned_by
 from vitamin3d.localization.rotation_tracking import unit_rays
@@ -54,7 +54,7 @@ def initialize_from_two_views(pixels_0: Array, pixels_1: Array, camera: Camera, 
 def _left_by_a_turn(view: TwoView, pixels_0: Array, pixels_1: Array, camera: Camera, config: InitializationConfig) -> float:
     """Median angle, degrees, that the best rotation alone leaves between the rays of the two views."""
     rays_0, rays_1 = unit_rays(pixels_0, camera), unit_rays(pixels_1, camera)
-    R = fit_rotation(rays_0, rays_1, view.T_1_0[:3, :3], config.ransac_threshold_px / camera.fx)
+    R = fit_rotation(rays_0, rays_1, view.T_1_0[:3, :3], camera.radians(config.ransac_threshold_px))
     return float(np.degrees(np.median(turned_by(rays_0, rays_1, R))))
 
 

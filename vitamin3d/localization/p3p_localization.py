@@ -4,24 +4,24 @@
 import numpy as np
 
 from vitamin3d._jit import inlined, kernel
-from vitamin3d._lanes import WIDTH, gather, lanes, total
+from vitamin3d._simd import WIDTH, gather, splat, total
 from vitamin3d.bundle_adjustment.normal_equations import add_camera, no_camera, write_camera
 from vitamin3d.bundle_adjustment.observations import information, robust_cost, rows_from
 from vitamin3d.bundle_adjustment.subspace import new_scratch
 from vitamin3d.bundle_adjustment.variables import pinhole_model
 from vitamin3d.config import LocalizationConfig
-from vitamin3d.geometry.camera import Camera
+from vitamin3d.geometry.cameras import Camera
 from vitamin3d.geometry.cholesky import solve_6x6
 from vitamin3d.geometry.p3p import p3p_ransac
 from vitamin3d.geometry.reprojection import (
     in_camera,
-    linearize_lanes,
+    linearize_simd,
     model_of,
     points_of,
     pose_of,
     reprojection_errors,
     retract,
-    squared_error_lanes,
+    squared_error_simd,
 )
 from vitamin3d.types import Array, Localization
 
@@ -40,10 +40,10 @@ def _rows(points, pixels, pose, i):  # type: ignore[no-untyped-def]
 
 @kernel
 def _cost(models, R, t, points, pixels, inverse_squared_sigma):  # type: ignore[no-untyped-def]
-    model, pose, cost = model_of(models, 0), pose_of(R, t, 0), lanes(0.0)
+    model, pose, cost = model_of(models, 0), pose_of(R, t, 0), splat(0.0)
     for i in range(0, points.shape[0], WIDTH):
         is_there, x, y, z, u, v = _rows(points, pixels, pose, i)
-        cost = cost + robust_cost(is_there, squared_error_lanes(x, y, z, False, model, u, v), inverse_squared_sigma)
+        cost = cost + robust_cost(is_there, squared_error_simd(x, y, z, False, model, u, v), inverse_squared_sigma)
     return total(cost)
 
 
@@ -53,7 +53,7 @@ def _normal_equations(models, R, t, points, pixels, inverse_squared_sigma, sums,
     model, pose, block = model_of(models, 0), pose_of(R, t, 0), no_camera()
     for i in range(0, points.shape[0], WIDTH):
         is_there, x, y, z, u, v = _rows(points, pixels, pose, i)
-        is_seen, q, a, b, r0, r1, p00, p01, p10, p11 = linearize_lanes(x, y, z, False, model, u, v)
+        is_seen, q, a, b, r0, r1, p00, p01, p10, p11 = linearize_simd(x, y, z, False, model, u, v)
         _, _, g00, g01, g11, h0, h1, _, _, _ = information(is_there, is_seen, r0, r1, p00, p01, p10, p11, inverse_squared_sigma, 0.0)
         block = add_camera(block, q, a, b, g00, g01, g11, h0, h1)
     write_camera(block, sums, H, g)

@@ -3,7 +3,7 @@
 
 import numpy as np
 
-from vitamin3d.geometry.camera import Camera
+from vitamin3d.geometry.cameras import Camera
 from vitamin3d.types import Array
 
 LEAST_SIGMA_PX = 0.5
@@ -22,12 +22,10 @@ def position_deviation_deg(points_cam: Array, errors_px: Array, camera: Camera) 
         points_cam: (N, 3) landmarks in the camera frame, those that the pose comes from.
         errors_px: (N,) their reprojection errors.
     """
-    x, y, depth = points_cam[:, 0] / points_cam[:, 2], points_cam[:, 1] / points_cam[:, 2], points_cam[:, 2]
+    depth = points_cam[:, 2]
     if len(depth) < MIN_LANDMARKS:
         return UNKNOWN_DEG
-    zero = np.zeros_like(x)
-    J_u = camera.fx * np.stack([1.0 / depth, zero, -x / depth, -x * y, 1.0 + x * x, -y], axis=1)
-    J_v = camera.fy * np.stack([zero, 1.0 / depth, -y / depth, -1.0 - y * y, x * y, x], axis=1)
+    J_u, J_v = camera.pose_jacobians(points_cam)
     variance = max(LEAST_SIGMA_PX**2, 0.5 * float((errors_px**2).mean()))
     H = J_u.T @ J_u + J_v.T @ J_v
     if np.linalg.matrix_rank(H, hermitian=True) < len(H):

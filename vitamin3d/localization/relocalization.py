@@ -12,7 +12,7 @@ import numpy as np
 from scipy.spatial import cKDTree
 
 from vitamin3d.config import LocalizationConfig, RelocalizationConfig
-from vitamin3d.geometry.camera import Camera
+from vitamin3d.geometry.cameras import Camera
 from vitamin3d.image.corners import described_corners, mutual_matches
 from vitamin3d.localization.p3p_localization import localize
 from vitamin3d.sparse_map import SparseMap

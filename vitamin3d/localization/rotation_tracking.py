@@ -10,7 +10,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from vitamin3d.config import RotationConfig
-from vitamin3d.geometry.camera import Camera
+from vitamin3d.geometry.cameras import Camera
 from vitamin3d.geometry.rotation_fit import fit_rotation, turned_by
 from vitamin3d.geometry.se3 import rotation_angle_deg
 from vitamin3d.growing_array import GrowingArray, IdRows
@@ -114,7 +114,7 @@ def rotation_of(directions: Array, pixels: Array, ages: Array, R_before: Array, 
     directions, rays, ages = directions[known], unit_rays(pixels[known], camera), ages[known]
     if len(rays) < config.min_tracks or not config.enabled:
         return None
-    sigma = max(config.sigma_px / camera.fx, np.radians(config.sigma_deg))
+    sigma = max(camera.radians(config.sigma_px), np.radians(config.sigma_deg))
     R = fit_rotation(directions, rays, R_before, sigma)
     agrees = turned_by(directions, rays, R) < INLIER_SIGMAS * sigma
     is_old = ages >= np.median(ages)

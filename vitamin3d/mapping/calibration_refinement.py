@@ -11,10 +11,10 @@ from dataclasses import dataclass, field
 import numpy as np
 
 from vitamin3d.bundle_adjustment.problem import BundleProblem, points_of_long_tracks, select_points
-from vitamin3d.bundle_adjustment.self_calibration import CalibrationReport, adjust_with_intrinsics, parameter_basis
+from vitamin3d.bundle_adjustment.self_calibration import CalibrationReport, adjust_with_intrinsics, aspect_of, parameter_basis
 from vitamin3d.bundle_adjustment.subspace import adjust_subspace
 from vitamin3d.config import CalibrationConfig
-from vitamin3d.geometry.camera import Camera
+from vitamin3d.geometry.cameras import Camera
 from vitamin3d.geometry.rolling_shutter import ideal_pixels, measured_pixels
 from vitamin3d.geometry.se3 import inverse
 from vitamin3d.mapping.readout_estimation import estimate_readout, frame_interval_s
@@ -79,7 +79,7 @@ class CalibrationRefinement:
         problem = build_problem(sparse_map, window)
         chosen = points_of_long_tracks(problem, self.config.points_per_keyframe)
         free = tuple(self.config.parameters.split())
-        priors = {"f": self.config.prior_focal * camera.fx, "k1": self.config.prior_distortion}
+        priors = {"f": self.config.prior_focal * camera.parameters["fx"], "k1": self.config.prior_distortion}
         solved, refined, report = adjust_with_intrinsics(
             select_points(problem, chosen), camera, free, self.config.sigma_px, self.config.iterations, priors=priors
         )
@@ -94,7 +94,7 @@ class CalibrationRefinement:
     def _refine_readout(self, sparse_map: SparseMap, camera: Camera) -> Camera:
         found, interval = estimate_readout(sparse_map, camera, self.config), frame_interval_s(sparse_map)
         deviation = self.config.readout_systematic_factor * found.deviation_s
-        refined, reason = dataclasses.replace(camera, readout_s=float(np.clip(found.readout_s, -interval, interval))), ""
+        refined, reason = camera.with_readout(float(np.clip(found.readout_s, -interval, interval))), ""
         if not deviation <= self.config.max_readout_deviation * interval:
             reason = "the motion does not determine the readout time"
         elif abs(found.readout_s) > interval + deviation:
@@ -113,11 +113,12 @@ class CalibrationRefinement:
         """Why the refined camera is not believed; empty where it is."""
         if not np.isfinite(list(deviations.values())).all() or not np.isfinite(report.costs[-1]):
             return "the adjustment failed"
-        if abs(refined.fx / self.given.fx - 1.0) > self.config.max_change:
-            return f"a focal length of {refined.fx:.1f} px is too far from the given one"
+        fx, given_fx = refined.parameters["fx"], self.given.parameters["fx"]
+        if abs(fx / given_fx - 1.0) > self.config.max_change:
+            return f"a focal length of {fx:.1f} px is too far from the given one"
         if self.config.refine == "on":
             return ""
-        focal = deviations.get("f", 0.0) / refined.fx
+        focal = deviations.get("f", 0.0) / fx
         if focal > self.config.max_focal_deviation:
             return f"the motion does not determine the focal length (± {100.0 * focal:.1f} %)"
         if not self._was_refined() and self._distance(report, refined) < self.config.significance:
@@ -129,7 +130,7 @@ class CalibrationRefinement:
 
     def _distance(self, report: CalibrationReport, refined: Camera) -> float:
         """From the given calibration, all parameters together, in standard deviations (Mahalanobis)."""
-        basis = parameter_basis(report.names, self.given.fy / self.given.fx)
+        basis = parameter_basis(report.names, aspect_of(self.given))
         moved = np.linalg.pinv(basis) @ (refined.model - self.given.model)
         return float(np.sqrt(moved @ np.linalg.solve(report.covariance, moved))) / self.config.systematic_factor
 

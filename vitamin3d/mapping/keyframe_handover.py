@@ -4,7 +4,7 @@
 import numpy as np
 
 from vitamin3d.config import Config, WindowConfig
-from vitamin3d.geometry.camera import Camera
+from vitamin3d.geometry.cameras import Camera
 from vitamin3d.geometry.rolling_shutter import at_one_moment
 from vitamin3d.mapping.landmark_statistics import UnitInformation, keyframe_vertices
 from vitamin3d.mapping.visible_landmarks import with_unobserved

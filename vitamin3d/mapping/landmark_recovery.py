@@ -5,7 +5,7 @@ import numpy as np
 
 from vitamin3d._jit import kernel
 from vitamin3d.config import RecoveryConfig
-from vitamin3d.geometry.camera import Camera
+from vitamin3d.geometry.cameras import Camera
 from vitamin3d.geometry.rolling_shutter import measured_pixels
 from vitamin3d.geometry.se3 import inverse
 from vitamin3d.image.extrema import subpixel_offset
@@ -67,7 +67,7 @@ def _list_candidates(  # type: ignore[no-untyped-def]
 def _visible_candidates(sparse_map: SparseMap, live: Array, T_cam_world: Array, camera: Camera, config: RecoveryConfig) -> Array:
     """Rows of landmarks, not among the `live` rows (N,), that were last seen from a similar direction and distance."""
     size, canvas = len(sparse_map.points_world), camera.whole_canvas
-    view = camera.fx, camera.fy, canvas.cx, canvas.cy, canvas.width, canvas.height
+    view = *canvas.intrinsics, canvas.width, canvas.height
     is_live, rows = np.zeros(size, np.bool_), np.empty(size, np.int64)
     is_live[live[(live >= 0) & (live < size)]] = True
     centres = np.ascontiguousarray(inverse(np.concatenate([sparse_map.T_cam_world, T_cam_world[None]]))[:, :3, 3])

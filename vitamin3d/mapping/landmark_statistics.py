@@ -8,7 +8,7 @@ import numpy as np
 
 from vitamin3d._jit import kernel
 from vitamin3d.config import CloudConfig, SnapshotConfig
-from vitamin3d.geometry.camera import Camera
+from vitamin3d.geometry.cameras import Camera
 from vitamin3d.geometry.reprojection import linearize, squared_error
 from vitamin3d.geometry.se3 import inverse
 from vitamin3d.sparse_map import SparseMap

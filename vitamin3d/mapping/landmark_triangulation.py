@@ -6,7 +6,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from vitamin3d.config import TriangulationConfig
-from vitamin3d.geometry.camera import Camera
+from vitamin3d.geometry.cameras import Camera
 from vitamin3d.geometry.se3 import inverse
 from vitamin3d.geometry.triangulation import triangulate
 from vitamin3d.mapping.landmark_statistics import add_squared_errors

@@ -10,7 +10,7 @@ from vitamin3d.bundle_adjustment.schur import adjust_accelerated
 from vitamin3d.bundle_adjustment.subspace import adjust_subspace
 from vitamin3d.bundle_adjustment.variables import squared_reprojection_errors
 from vitamin3d.config import Config
-from vitamin3d.geometry.camera import Camera
+from vitamin3d.geometry.cameras import Camera
 from vitamin3d.mapping.window_adjustment import Adjuster, WindowAdjustment, store_adjustment
 from vitamin3d.mapping.window_prior import WindowPrior
 from vitamin3d.mapping.window_selection import Window, build_problem, select_frame_window, select_window, store_solution, whole_map

@@ -6,7 +6,7 @@ from dataclasses import replace
 import numpy as np
 
 from vitamin3d.config import Config
-from vitamin3d.geometry.camera import Camera
+from vitamin3d.geometry.cameras import Camera
 from vitamin3d.geometry.se3 import inverse
 from vitamin3d.mapping.calibration_refinement import CalibrationRefinement
 from vitamin3d.mapping.keyframe_handover import KeyframeHandover, snapshot_of

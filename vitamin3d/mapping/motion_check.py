@@ -11,7 +11,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from vitamin3d.config import MotionCheckConfig
-from vitamin3d.geometry.camera import Camera
+from vitamin3d.geometry.cameras import Camera
 from vitamin3d.geometry.epipolar_refinement import best_motion, motion_cost
 from vitamin3d.geometry.se3 import inverse, rotation_angle_deg
 from vitamin3d.sparse_map import SparseMap
@@ -59,7 +59,7 @@ def _opinion(keyframe: int, T_1_0: Array, pixels_0: Array, pixels_1: Array, came
         return None
     some = slice(None, None, -(-len(pixels_0) // config.max_pairs))
     rays_0, rays_1 = camera.rays_from_ideal(pixels_0[some]), camera.rays_from_ideal(pixels_1[some])
-    sigma = config.sigma_px / camera.fx
+    sigma = camera.radians(config.sigma_px)
     best = best_motion(R, t, rays_0, rays_1, sigma)
     ratio = motion_cost(R, t, rays_0, rays_1, sigma) / max(best.cost, 1e-12)
     direction = np.degrees(np.arccos(np.clip(abs(best.t @ t) / np.linalg.norm(t), 0.0, 1.0)))

@@ -13,7 +13,7 @@ import numpy as np
 from vitamin3d.bundle_adjustment.problem import BundleProblem, points_of_long_tracks, select_points
 from vitamin3d.bundle_adjustment.schur import adjust_schur
 from vitamin3d.config import CalibrationConfig
-from vitamin3d.geometry.camera import Camera
+from vitamin3d.geometry.cameras import Camera
 from vitamin3d.geometry.rolling_shutter import ideal_pixels, measured_pixels
 from vitamin3d.mapping.window_selection import Window, build_problem
 from vitamin3d.sparse_map import SparseMap
@@ -102,7 +102,7 @@ class _Block:
         return np.array([before, report.costs[-1], after]), report
 
     def _adjusted(self, start: BundleProblem, readout_s: float, sigma_px: float) -> tuple[BundleProblem, BundleReport]:
-        pixels = ideal_pixels(self.measured, self.motions, dataclasses.replace(self.camera, readout_s=readout_s))
+        pixels = ideal_pixels(self.measured, self.motions, self.camera.with_readout(readout_s))
         pixels = np.where(np.isfinite(pixels), pixels, self.problem.obs_pixels)
         return adjust_schur(dataclasses.replace(start, obs_pixels=pixels), self.camera, sigma_px, ITERATIONS, RELATIVE_GAIN)
 

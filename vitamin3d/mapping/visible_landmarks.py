@@ -9,7 +9,7 @@ import numpy as np
 from scipy.spatial import cKDTree
 
 from vitamin3d.config import SnapshotConfig
-from vitamin3d.geometry.camera import Camera
+from vitamin3d.geometry.cameras import Camera
 from vitamin3d.mapping.landmark_statistics import UnitInformation, Vertices, vertices_of
 from vitamin3d.sparse_map import SparseMap
 from vitamin3d.types import Array

@@ -13,7 +13,7 @@ from vitamin3d.bundle_adjustment.rejection import with_observations
 from vitamin3d.bundle_adjustment.variables import pinhole_model, squared_reprojection_errors
 from vitamin3d.config import Config
 from vitamin3d.errors import InputError
-from vitamin3d.geometry.camera import Camera
+from vitamin3d.geometry.cameras import Camera
 from vitamin3d.mapping.window_selection import Window, build_problem
 from vitamin3d.sparse_map import SparseMap
 from vitamin3d.types import Array

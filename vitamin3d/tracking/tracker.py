@@ -6,7 +6,7 @@ from collections.abc import Sequence
 import numpy as np
 
 from vitamin3d.config import Config
-from vitamin3d.geometry.camera import Camera
+from vitamin3d.geometry.cameras import Camera
 from vitamin3d.geometry.rolling_shutter import NO_MOTION, fit_image_motion, ideal_pixels
 from vitamin3d.image.extrema import refine_extrema, select_free_extrema
 from vitamin3d.tracking.extrema_tracking import predict_by_dense_flow, predict_by_dominant_flow, track_extrema

@@ -5,28 +5,28 @@ import numpy as np
 import pytest
 
 from vitamin3d._jit import kernel
-from vitamin3d._lanes import (
+from vitamin3d._simd import (
     WIDE,
     WIDTH,
     any_of,
     counting,
-    counting_shorts,
+    counting_i16,
     gather,
     greatest,
-    lanes,
     least,
     lesser,
     load,
-    load_shorts,
-    load_singles,
+    load_f32,
+    load_i16,
     scatter,
     select,
-    shorts,
-    singles,
+    splat,
+    splat_f32,
+    splat_i16,
     square_root,
     store,
     total,
-    total_single,
+    total_f32,
     transposed,
     where_below,
 )
@@ -51,7 +51,7 @@ def arithmetic(a, b, c, out):
     x *= y
     x -= c
     store(out, 7 * WIDTH, x)
-    store(out, 8 * WIDTH, lanes(c))
+    store(out, 8 * WIDTH, splat(c))
 
 
 def test_arithmetic(ab):
@@ -121,11 +121,11 @@ def test_nan_stays_nan(ab):
 
 @kernel
 def with_shorts(a, b, c, out):
-    x, y = load_shorts(a, 1), load_shorts(b, 0)
+    x, y = load_i16(a, 1), load_i16(b, 0)
     store(out, 0, x + y - c)
     store(out, WIDE, lesser(x, y))
     store(out, 2 * WIDE, lesser(x, c))
-    store(out, 3 * WIDE, where_below(x, y, counting_shorts(c), shorts(-2)))
+    store(out, 3 * WIDE, where_below(x, y, counting_i16(c), splat_i16(-2)))
     return least(x), least(y)
 
 
@@ -140,12 +140,12 @@ def test_sixteen_shorts(rng):
 
 @kernel
 def with_singles(a, b, c, out):
-    x, y = load_singles(a, 1), load_singles(b, 0)
+    x, y = load_f32(a, 1), load_f32(b, 0)
     store(out, 0, x + y)
     store(out, WIDE, x - c)
     store(out, 2 * WIDE, c * x)
-    store(out, 3 * WIDE, singles(c))
-    return total_single(x)
+    store(out, 3 * WIDE, splat_f32(c))
+    return total_f32(x)
 
 
 def test_sixteen_singles(rng):

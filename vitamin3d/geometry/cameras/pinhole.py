@@ -8,6 +8,7 @@ import cv2
 import numpy as np
 
 from vitamin3d._jit import inlined, kernel
+from vitamin3d.geometry.cameras.protocol import Camera
 from vitamin3d.types import Array
 
 NEWTON_STEPS = 20
@@ -71,7 +72,7 @@ def _undistort_pixels(pixels, model, steps, tolerance, out):  # type: ignore[no-
 
 
 @dataclass(frozen=True)
-class Camera:
+class PinholeCamera:
     """A calibrated camera: intrinsics in pixels, distortion, picture size."""
 
     fx: float
@@ -100,7 +101,25 @@ class Camera:
         """(8,) fx fy cx cy k1 k2 p1 p2, for the kernels."""
         return np.array([self.fx, self.fy, self.cx, self.cy, *self.distortion])
 
-    def with_model(self, model: Array) -> "Camera":
+    @property
+    def parameters(self) -> dict[str, float]:
+        """By name, pixels; distortion without unit."""
+        return dict(zip(("fx", "fy", "cx", "cy", "k1", "k2", "p1", "p2"), self.model.tolist(), strict=True))
+
+    @property
+    def half_field(self) -> tuple[float, float]:
+        """Tangents of half the angles of view, right and down."""
+        return 0.5 * self.width / self.fx, 0.5 * self.height / self.fy
+
+    def radians(self, pixels: float) -> float:
+        """The angle that so many pixels make up in the middle of the picture."""
+        return pixels / self.fx
+
+    def with_readout(self, readout_s: float) -> "PinholeCamera":
+        """The same camera with another readout time."""
+        return replace(self, readout_s=readout_s)
+
+    def with_model(self, model: Array) -> "PinholeCamera":
         """A camera with the same picture and `model` (8,) fx fy cx cy k1 k2 p1 p2."""
         fx, fy, cx, cy, k1, k2, p1, p2 = (float(value) for value in model)
         return replace(self, fx=fx, fy=fy, cx=cx, cy=cy, distortion=(k1, k2, p1, p2))
@@ -108,6 +127,22 @@ class Camera:
     @property
     def is_distorted(self) -> bool:
         return any(self.distortion)
+
+    def project(self, points_cam: Array) -> Array:
+        """Distorted pixels (N, 2) of points (N, 3) in the camera frame; NaN behind the camera."""
+        return self.distort(self.ideal_from_points(points_cam))
+
+    def unproject(self, pixels: Array) -> Array:
+        """Rays (N, 3) with z = 1 of distorted pixels (N, 2); NaN where the model cannot be inverted."""
+        return self.rays_from_ideal(self.undistort(pixels))
+
+    def pose_jacobians(self, points_cam: Array) -> tuple[Array, Array]:
+        """(N, 6) each: derivatives of the ideal pixels u and v by the tangent [translation, rotation] of the pose."""
+        x, y, depth = points_cam[:, 0] / points_cam[:, 2], points_cam[:, 1] / points_cam[:, 2], points_cam[:, 2]
+        zero = np.zeros_like(x)
+        J_u = self.fx * np.stack([1.0 / depth, zero, -x / depth, -x * y, 1.0 + x * x, -y], axis=1)
+        J_v = self.fy * np.stack([zero, 1.0 / depth, -y / depth, -1.0 - y * y, x * y, x], axis=1)
+        return J_u, J_v
 
     def ideal_from_points(self, points_cam: Array) -> Array:
         """Ideal pixels (N, 2) of points (N, 3) in the camera frame; NaN behind the camera."""
@@ -142,14 +177,14 @@ class Camera:
         u, v = pixels[:, 0], pixels[:, 1]
         return np.asarray((u >= margin) & (v >= margin) & (u <= self.width - 1 - margin) & (v <= self.height - 1 - margin))
 
-    def canvas(self, limit: float = 0.5) -> "Camera":
+    def canvas(self, limit: float = 0.5) -> "PinholeCamera":
         """The undistorted camera that holds the whole picture: the same focal lengths, a wider image.
 
         The canvas grows on each side by at most `limit` times the picture's size, for lenses whose corners
         lie far outside.
         """
         if not self.is_distorted:
-            return Camera(self.fx, self.fy, self.cx, self.cy, self.width, self.height)
+            return PinholeCamera(self.fx, self.fy, self.cx, self.cy, self.width, self.height)
         us, vs = np.arange(self.width, dtype=float), np.arange(self.height, dtype=float)
         border = np.concatenate(
             [np.stack(np.broadcast_arrays(u, v), -1) for u, v in ((us, 0.0), (us, self.height - 1.0), (0.0, vs), (self.width - 1.0, vs))]
@@ -160,24 +195,29 @@ class Camera:
         high = np.minimum(np.ceil(np.nanmax(ideal, axis=0)), size - 1 + np.ceil(limit * size))
         left, top = np.minimum(low, 0.0)
         width, height = (np.maximum(high, size - 1) - np.minimum(low, 0.0) + 1).astype(int)
-        return Camera(self.fx, self.fy, float(self.cx - left), float(self.cy - top), int(width), int(height))
+        return PinholeCamera(self.fx, self.fy, float(self.cx - left), float(self.cy - top), int(width), int(height))
 
-    def scaled(self, factor: float) -> "Camera":
+    def scaled(self, factor: float) -> "PinholeCamera":
         """The camera of the same picture with `factor` times as many pixels along each side, without distortion."""
         cx, cy = (factor * (center + 0.5) - 0.5 for center in (self.cx, self.cy))
-        return Camera(factor * self.fx, factor * self.fy, cx, cy, round(factor * self.width), round(factor * self.height))
+        return PinholeCamera(factor * self.fx, factor * self.fy, cx, cy, round(factor * self.width), round(factor * self.height))
 
-    def ideal_in(self, other: "Camera", pixels: Array) -> Array:
+    def cropped(self, width: int, height: int) -> "PinholeCamera":
+        """The camera of the picture's part from its top left corner on."""
+        return replace(self, width=width, height=height)
+
+    def ideal_in(self, other: Camera, pixels: Array) -> Array:
         """Ideal pixels (N, 2) of this camera where another camera at the same place, turned alike, sees the same rays."""
-        factors = np.array([other.fx / self.fx, other.fy / self.fy])
-        return np.asarray(factors * (pixels - [self.cx, self.cy]) + [other.cx, other.cy])
+        there = other.intrinsics
+        factors = there[:2] / [self.fx, self.fy]
+        return np.asarray(factors * (pixels - [self.cx, self.cy]) + there[2:])
 
     @cached_property
-    def whole_canvas(self) -> "Camera":
+    def whole_canvas(self) -> "PinholeCamera":
         """`canvas` with its own limit, computed once."""
         return self.canvas()
 
-    def canvas_maps(self, canvas: "Camera") -> tuple[Array, Array]:
+    def canvas_maps(self, canvas: Camera) -> tuple[Array, Array]:
         """`cv2.remap` maps (H, W) float32 that draw this camera's picture on `canvas`."""
         grid = np.stack(np.meshgrid(np.arange(canvas.width, dtype=float), np.arange(canvas.height, dtype=float)), -1).reshape(-1, 2)
         ideal = canvas.rays_from_ideal(grid)[:, :2] * [self.fx, self.fy] + [self.cx, self.cy]

@@ -7,7 +7,7 @@ import pytest
 import reference
 from scenes import EUROC, PINHOLE
 
-from vitamin3d.geometry.camera import Camera
+from vitamin3d.geometry.cameras import PinholeCamera
 
 
 def grid(camera, step=37):
@@ -108,7 +108,7 @@ def test_a_scaled_camera_sees_the_same_picture_in_other_pixels(rng):
 
 @pytest.mark.parametrize("coefficients", [EUROC.distortion, (0.3, 0.1, 0.0, 0.0)], ids=["barrel", "pincushion"])
 def test_the_canvas_shows_the_picture_where_it_belongs(coefficients):
-    camera = dataclasses.replace(Camera(90.0, 92.0, 60.2, 45.1, 121, 93), distortion=coefficients)
+    camera = dataclasses.replace(PinholeCamera(90.0, 92.0, 60.2, 45.1, 121, 93), distortion=coefficients)
     canvas = camera.canvas()
     us, vs = np.meshgrid(np.arange(121.0), np.arange(93.0))
     ramp = (40 + us + vs / 2).astype(np.float32)  # linear, so that bilinear sampling is exact

@@ -1,8 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
 """Eight numbers at a time, for kernels: LLVM does not vectorise sums whose order it must keep, nor gathers from many arrays.
 
-Inside a kernel `Lanes` are eight float64 and calculate like one number, with numbers too; `Indices` are eight int64, `Masks` eight
-truths. `Singles` are sixteen float32, `Shorts` sixteen int16, which nothing keeps from overflowing. Each operation is one of LLVM's
+Inside a kernel `Float64x8` are eight float64 and calculate like one number, with numbers too; `Int64x8` are eight int64, `Boolx8` eight
+truths. `Float32x16` are sixteen float32, `Int16x16` sixteen int16, which nothing keeps from overflowing. Each operation is one of LLVM's
 on a vector, which becomes one or several instructions of whatever processor there is. A product and the sum it goes into may be
 fused, as the processor can; NaN and infinities are what they are. Arrays that are read and written must be C-contiguous and are
 addressed as flat ones; nothing checks bounds.
@@ -23,7 +23,7 @@ _BOOL, _INT16, _INT32, _INT64 = ir.IntType(1), ir.IntType(16), ir.IntType(32), i
 _DOUBLE, _SINGLE = ir.DoubleType(), ir.FloatType()
 
 
-class LanesType(types.Type):  # type: ignore[misc,unused-ignore]
+class SimdType(types.Type):  # type: ignore[misc,unused-ignore]
     """Eight numbers of one kind, as numba knows them."""
 
     def __init__(self, name: str, element: Any, width: int) -> None:
@@ -32,28 +32,28 @@ class LanesType(types.Type):  # type: ignore[misc,unused-ignore]
 
 
 class _VectorModel(models.PrimitiveModel):  # type: ignore[misc,unused-ignore]
-    def __init__(self, manager: Any, numba_type: LanesType) -> None:
+    def __init__(self, manager: Any, numba_type: SimdType) -> None:
         super().__init__(manager, numba_type, numba_type.vector)
 
 
-register_model(LanesType)(_VectorModel)
-Lanes, Indices, Masks = (LanesType(*kind, WIDTH) for kind in (("Lanes", _DOUBLE), ("Indices", _INT64), ("Masks", _BOOL)))
-Singles, Shorts = LanesType("Singles", _SINGLE, WIDE), LanesType("Shorts", _INT16, WIDE)
-_SCALARS = {Lanes: types.float64, Indices: types.int64, Masks: types.boolean, Singles: types.float32, Shorts: types.int64}
+register_model(SimdType)(_VectorModel)
+Float64x8, Int64x8, Boolx8 = (SimdType(*kind, WIDTH) for kind in (("Float64x8", _DOUBLE), ("Int64x8", _INT64), ("Boolx8", _BOOL)))
+Float32x16, Int16x16 = SimdType("Float32x16", _SINGLE, WIDE), SimdType("Int16x16", _INT16, WIDE)
+_SCALARS = {Float64x8: types.float64, Int64x8: types.int64, Boolx8: types.boolean, Float32x16: types.float32, Int16x16: types.int64}
 
 
-def _vector(builder: Any, kind: LanesType, numba_type: Any, value: Any) -> Any:
+def _vector(builder: Any, kind: SimdType, numba_type: Any, value: Any) -> Any:
     """A vector as it is, a number eight times."""
-    if isinstance(numba_type, LanesType):
+    if isinstance(numba_type, SimdType):
         return value
-    if kind in (Masks, Shorts):
+    if kind in (Boolx8, Int16x16):
         value = builder.trunc(value, kind.vector.element)
     nothing, count = ir.Constant(kind.vector, ir.Undefined), kind.vector.count
     first = builder.insert_element(nothing, value, _INT32(0))
     return builder.shuffle_vector(first, nothing, ir.Constant(ir.VectorType(_INT32, count), [0] * count))
 
 
-def _operation(function: Any, kind: LanesType, result: LanesType, build: Callable[..., Any]) -> None:
+def _operation(function: Any, kind: SimdType, result: SimdType, build: Callable[..., Any]) -> None:
     """Lets kernels apply a binary operator to vectors of a kind, and to one and a number."""
     pairs = ((kind, kind), (kind, _SCALARS[kind]), (_SCALARS[kind], kind))
     infer_global(function)(type("Cases", (ConcreteTemplate,), {"cases": [signature(result, *pair) for pair in pairs]}))
@@ -80,58 +80,58 @@ for _functions, _instructions in (
     ((operator.truediv,), ("fdiv", None)),
 ):
     for _function in _functions:
-        for _kind, _instruction in zip((Lanes, Indices, Singles, Shorts), 2 * _instructions, strict=True):
+        for _kind, _instruction in zip((Float64x8, Int64x8, Float32x16, Int16x16), 2 * _instructions, strict=True):
             if _instruction is not None:
                 _operation(_function, _kind, _kind, partial(_arithmetic, instruction=_instruction))
 for _function, _sign in ((operator.lt, "<"), (operator.le, "<="), (operator.gt, ">"), (operator.ge, ">=")):
-    for _kind in (Lanes, Indices):
-        _operation(_function, _kind, Masks, partial(_compared, sign=_sign))
-_operation(operator.and_, Masks, Masks, lambda builder, a, b: builder.and_(a, b))
-_operation(operator.xor, Masks, Masks, lambda builder, a, b: builder.xor(a, b))
-infer_global(operator.neg)(type("Cases", (ConcreteTemplate,), {"cases": [signature(Lanes, Lanes)]}))
+    for _kind in (Float64x8, Int64x8):
+        _operation(_function, _kind, Boolx8, partial(_compared, sign=_sign))
+_operation(operator.and_, Boolx8, Boolx8, lambda builder, a, b: builder.and_(a, b))
+_operation(operator.xor, Boolx8, Boolx8, lambda builder, a, b: builder.xor(a, b))
+infer_global(operator.neg)(type("Cases", (ConcreteTemplate,), {"cases": [signature(Float64x8, Float64x8)]}))
 
 
-@lower_builtin(operator.neg, Lanes)  # type: ignore[untyped-decorator,unused-ignore]
+@lower_builtin(operator.neg, Float64x8)  # type: ignore[untyped-decorator,unused-ignore]
 def _negative(context: Any, builder: Any, sig: Any, arguments: Any) -> Any:
     return builder.fneg(arguments[0])
 
 
-def _kind_of(*numba_types: Any) -> LanesType:
-    return next((t for t in numba_types if isinstance(t, LanesType)), Lanes)
+def _kind_of(*numba_types: Any) -> SimdType:
+    return next((t for t in numba_types if isinstance(t, SimdType)), Float64x8)
 
 
-def _element(numba_type: Any) -> LanesType:
+def _element(numba_type: Any) -> SimdType:
     """What eight of an array's elements are."""
-    return Lanes if isinstance(numba_type.dtype, types.Float) else Indices
+    return Float64x8 if isinstance(numba_type.dtype, types.Float) else Int64x8
 
 
 @intrinsic  # type: ignore[untyped-decorator,unused-ignore]
-def lanes(typing, number):  # type: ignore[no-untyped-def]
+def splat(typing, number):  # type: ignore[no-untyped-def]
     """The number eight times; lanes as they are."""
-    return Lanes(number), lambda context, builder, sig, arguments: _vector(builder, Lanes, sig.args[0], arguments[0])
+    return Float64x8(number), lambda context, builder, sig, arguments: _vector(builder, Float64x8, sig.args[0], arguments[0])
 
 
 @intrinsic  # type: ignore[untyped-decorator,unused-ignore]
 def counting(typing, first):  # type: ignore[no-untyped-def]
-    """Indices first, first + 1, ..."""
+    """Int64x8 first, first + 1, ..."""
 
     def build(context, builder, sig, arguments):  # type: ignore[no-untyped-def]
-        return builder.add(_vector(builder, Indices, types.int64, arguments[0]), ir.Constant(Indices.vector, list(range(WIDTH))))
+        return builder.add(_vector(builder, Int64x8, types.int64, arguments[0]), ir.Constant(Int64x8.vector, list(range(WIDTH))))
 
-    return Indices(types.int64), build
+    return Int64x8(types.int64), build
 
 
 @intrinsic  # type: ignore[untyped-decorator,unused-ignore]
 def select(typing, condition, a, b):  # type: ignore[no-untyped-def]
     """Lane by lane a where the condition holds, else b; both are calculated."""
-    kind = Indices if Indices in (a, b) or (isinstance(a, types.Integer) and isinstance(b, types.Integer)) else Lanes
-    a, b = (t if isinstance(t, LanesType) else _SCALARS[kind] for t in (a, b))
+    kind = Int64x8 if Int64x8 in (a, b) or (isinstance(a, types.Integer) and isinstance(b, types.Integer)) else Float64x8
+    a, b = (t if isinstance(t, SimdType) else _SCALARS[kind] for t in (a, b))
 
     def build(context, builder, sig, arguments):  # type: ignore[no-untyped-def]
         chosen = (_vector(builder, kind, t, x) for t, x in zip(sig.args[1:], arguments[1:], strict=True))
         return builder.select(arguments[0], *chosen)
 
-    return kind(Masks, a, b), build
+    return kind(Boolx8, a, b), build
 
 
 @intrinsic  # type: ignore[untyped-decorator,unused-ignore]
@@ -139,11 +139,11 @@ def square_root(typing, x):  # type: ignore[no-untyped-def]
     """Of each lane; NaN of a negative one."""
 
     def build(context, builder, sig, arguments):  # type: ignore[no-untyped-def]
-        function_type = ir.FunctionType(Lanes.vector, [Lanes.vector])
+        function_type = ir.FunctionType(Float64x8.vector, [Float64x8.vector])
         function = cgutils.get_or_insert_function(builder.module, function_type, f"llvm.sqrt.v{WIDTH}f64")
         return builder.call(function, arguments)
 
-    return Lanes(Lanes), build
+    return Float64x8(Float64x8), build
 
 
 @intrinsic  # type: ignore[untyped-decorator,unused-ignore]
@@ -156,12 +156,12 @@ def total(typing, x):  # type: ignore[no-untyped-def]
             parts = [builder.fadd(a, b) for a, b in zip(parts[::2], parts[1::2], strict=True)]
         return parts[0]
 
-    return types.float64(Lanes), build
+    return types.float64(Float64x8), build
 
 
 @intrinsic  # type: ignore[untyped-decorator,unused-ignore]
-def total_single(typing, x):  # type: ignore[no-untyped-def]
-    """The sum of `Singles`, always in the same order."""
+def total_f32(typing, x):  # type: ignore[no-untyped-def]
+    """The sum of `Float32x16`, always in the same order."""
 
     def build(context, builder, sig, arguments):  # type: ignore[no-untyped-def]
         parts, left = arguments[0], WIDE
@@ -171,87 +171,87 @@ def total_single(typing, x):  # type: ignore[no-untyped-def]
             parts = builder.fadd(builder.shuffle_vector(parts, parts, low), builder.shuffle_vector(parts, parts, high))
         return builder.extract_element(parts, _INT32(0))
 
-    return types.float32(Singles), build
+    return types.float32(Float32x16), build
 
 
 @intrinsic  # type: ignore[untyped-decorator,unused-ignore]
-def shorts(typing, number):  # type: ignore[no-untyped-def]
+def splat_i16(typing, number):  # type: ignore[no-untyped-def]
     """The number sixteen times."""
-    return Shorts(types.int64), lambda context, builder, sig, arguments: _vector(builder, Shorts, types.int64, arguments[0])
+    return Int16x16(types.int64), lambda context, builder, sig, arguments: _vector(builder, Int16x16, types.int64, arguments[0])
 
 
 @intrinsic  # type: ignore[untyped-decorator,unused-ignore]
-def singles(typing, number):  # type: ignore[no-untyped-def]
+def splat_f32(typing, number):  # type: ignore[no-untyped-def]
     """The number sixteen times."""
-    return Singles(types.float32), lambda context, builder, sig, arguments: _vector(builder, Singles, types.float32, arguments[0])
+    return Float32x16(types.float32), lambda context, builder, sig, arguments: _vector(builder, Float32x16, types.float32, arguments[0])
 
 
 @intrinsic  # type: ignore[untyped-decorator,unused-ignore]
 def least(typing, x):  # type: ignore[no-untyped-def]
-    """The smallest of `Shorts`."""
+    """The smallest of `Int16x16`."""
 
     def build(context, builder, sig, arguments):  # type: ignore[no-untyped-def]
-        function_type = ir.FunctionType(_INT16, [Shorts.vector])
+        function_type = ir.FunctionType(_INT16, [Int16x16.vector])
         function = cgutils.get_or_insert_function(builder.module, function_type, f"llvm.vector.reduce.smin.v{WIDE}i16")
         return builder.sext(builder.call(function, arguments), _INT64)
 
-    return types.int64(Shorts), build
+    return types.int64(Int16x16), build
 
 
 @intrinsic  # type: ignore[untyped-decorator,unused-ignore]
 def lesser(typing, a, b):  # type: ignore[no-untyped-def]
-    """Lane by lane the smaller one of `Shorts`, or of these and a number."""
-    a, b = (t if t is Shorts else types.int64 for t in (a, b))
+    """Lane by lane the smaller one of `Int16x16`, or of these and a number."""
+    a, b = (t if t is Int16x16 else types.int64 for t in (a, b))
 
     def build(context, builder, sig, arguments):  # type: ignore[no-untyped-def]
-        one, other = (_vector(builder, Shorts, t, x) for t, x in zip(sig.args, arguments, strict=True))
+        one, other = (_vector(builder, Int16x16, t, x) for t, x in zip(sig.args, arguments, strict=True))
         return builder.select(builder.icmp_signed("<", one, other), one, other)
 
-    return Shorts(a, b), build
+    return Int16x16(a, b), build
 
 
 @intrinsic  # type: ignore[untyped-decorator,unused-ignore]
 def where_below(typing, a, limit, x, y):  # type: ignore[no-untyped-def]
-    """Lane by lane x where a is below the limit, else y; `Shorts`, or numbers."""
-    arguments = tuple(t if t is Shorts else types.int64 for t in (a, limit, x, y))
+    """Lane by lane x where a is below the limit, else y; `Int16x16`, or numbers."""
+    arguments = tuple(t if t is Int16x16 else types.int64 for t in (a, limit, x, y))
 
     def build(context, builder, sig, arguments):  # type: ignore[no-untyped-def]
-        one, other, yes, no = (_vector(builder, Shorts, t, x) for t, x in zip(sig.args, arguments, strict=True))
+        one, other, yes, no = (_vector(builder, Int16x16, t, x) for t, x in zip(sig.args, arguments, strict=True))
         return builder.select(builder.icmp_signed("<", one, other), yes, no)
 
-    return Shorts(*arguments), build
+    return Int16x16(*arguments), build
 
 
 @intrinsic  # type: ignore[untyped-decorator,unused-ignore]
-def counting_shorts(typing, first):  # type: ignore[no-untyped-def]
-    """Shorts first, first + 1, ..."""
+def counting_i16(typing, first):  # type: ignore[no-untyped-def]
+    """Int16x16 first, first + 1, ..."""
 
     def build(context, builder, sig, arguments):  # type: ignore[no-untyped-def]
-        return builder.add(_vector(builder, Shorts, types.int64, arguments[0]), ir.Constant(Shorts.vector, list(range(WIDE))))
+        return builder.add(_vector(builder, Int16x16, types.int64, arguments[0]), ir.Constant(Int16x16.vector, list(range(WIDE))))
 
-    return Shorts(types.int64), build
+    return Int16x16(types.int64), build
 
 
 @intrinsic  # type: ignore[untyped-decorator,unused-ignore]
-def load_shorts(typing, array, first):  # type: ignore[no-untyped-def]
+def load_i16(typing, array, first):  # type: ignore[no-untyped-def]
     """Sixteen neighbouring numbers of an array of int16 or uint8."""
 
     def build(context, builder, sig, arguments):  # type: ignore[no-untyped-def]
         loaded = _loaded(context, builder, sig, arguments)
-        return loaded if loaded.type == Shorts.vector else builder.zext(loaded, Shorts.vector)
+        return loaded if loaded.type == Int16x16.vector else builder.zext(loaded, Int16x16.vector)
 
-    return Shorts(array, types.int64), build
+    return Int16x16(array, types.int64), build
 
 
 @intrinsic  # type: ignore[untyped-decorator,unused-ignore]
-def load_singles(typing, array, first):  # type: ignore[no-untyped-def]
+def load_f32(typing, array, first):  # type: ignore[no-untyped-def]
     """Sixteen neighbouring numbers of an array of float32 or uint8."""
 
     def build(context, builder, sig, arguments):  # type: ignore[no-untyped-def]
         loaded = _loaded(context, builder, sig, arguments)
-        return loaded if loaded.type == Singles.vector else builder.uitofp(loaded, Singles.vector)
+        return loaded if loaded.type == Float32x16.vector else builder.uitofp(loaded, Float32x16.vector)
 
-    return Singles(array, types.int64), build
+    return Float32x16(array, types.int64), build
 
 
 def _loaded(context: Any, builder: Any, sig: Any, arguments: Any) -> Any:
@@ -271,7 +271,7 @@ def greatest(typing, x):  # type: ignore[no-untyped-def]
             out = builder.select(builder.fcmp_ordered(">", other, out), other, out)
         return out
 
-    return types.float64(Lanes), build
+    return types.float64(Float64x8), build
 
 
 @intrinsic  # type: ignore[untyped-decorator,unused-ignore]
@@ -282,7 +282,7 @@ def any_of(typing, condition):  # type: ignore[no-untyped-def]
         bits = builder.bitcast(arguments[0], ir.IntType(WIDTH))
         return builder.icmp_unsigned("!=", bits, ir.IntType(WIDTH)(0))
 
-    return types.boolean(Masks), build
+    return types.boolean(Boolx8), build
 
 
 @intrinsic  # type: ignore[untyped-decorator,unused-ignore]
@@ -300,7 +300,7 @@ def transposed(typing, rows):  # type: ignore[no-untyped-def]
                     rows[i], rows[i + step] = builder.shuffle_vector(a, b, low), builder.shuffle_vector(a, b, high)
         return context.make_tuple(builder, sig.return_type, rows)
 
-    eight = types.UniTuple(Lanes, WIDTH)  # type: ignore[attr-defined,unused-ignore]
+    eight = types.UniTuple(Float64x8, WIDTH)  # type: ignore[attr-defined,unused-ignore]
     return eight(eight), build
 
 
@@ -314,9 +314,9 @@ def load(typing, array, first):  # type: ignore[no-untyped-def]
 
     def build(context, builder, sig, arguments):  # type: ignore[no-untyped-def]
         pointer = _address(context, builder, sig.args[0], *arguments)
-        return builder.load(builder.bitcast(pointer, Lanes.vector.as_pointer()), align=8)
+        return builder.load(builder.bitcast(pointer, Float64x8.vector.as_pointer()), align=8)
 
-    return Lanes(array, types.int64), build
+    return Float64x8(array, types.int64), build
 
 
 @intrinsic  # type: ignore[untyped-decorator,unused-ignore]
@@ -326,15 +326,15 @@ def store(typing, array, first, x):  # type: ignore[no-untyped-def]
     def build(context, builder, sig, arguments):  # type: ignore[no-untyped-def]
         pointer = _address(context, builder, sig.args[0], *arguments[:2])
         vector = sig.args[2].vector
-        builder.store(arguments[2], builder.bitcast(pointer, vector.as_pointer()), align=2 if vector == Shorts.vector else 4)
+        builder.store(arguments[2], builder.bitcast(pointer, vector.as_pointer()), align=2 if vector == Int16x16.vector else 4)
         return context.get_dummy_value()
 
-    return types.void(array, types.int64, x if x in (Shorts, Singles) else Lanes), build
+    return types.void(array, types.int64, x if x in (Int16x16, Float32x16) else Float64x8), build
 
 
 @intrinsic  # type: ignore[untyped-decorator,unused-ignore]
 def gather(typing, array, indices):  # type: ignore[no-untyped-def]
-    """array[index] of each lane; of integers these are `Indices` again."""
+    """array[index] of each lane; of integers these are `Int64x8` again."""
     kind = _element(array)
 
     def build(context, builder, sig, arguments):  # type: ignore[no-untyped-def]
@@ -342,12 +342,12 @@ def gather(typing, array, indices):  # type: ignore[no-untyped-def]
         for k in range(WIDTH):
             index = builder.extract_element(arguments[1], _INT32(k))
             value = builder.load(_address(context, builder, sig.args[0], arguments[0], index))
-            if kind is Indices and value.type != _INT64:
+            if kind is Int64x8 and value.type != _INT64:
                 value = builder.sext(value, _INT64)
             out = builder.insert_element(out, value, _INT32(k))
         return out
 
-    return kind(array, Indices), build
+    return kind(array, Int64x8), build
 
 
 @intrinsic  # type: ignore[untyped-decorator,unused-ignore]
@@ -360,4 +360,4 @@ def scatter(typing, array, indices, x):  # type: ignore[no-untyped-def]
             builder.store(value, _address(context, builder, sig.args[0], arguments[0], index))
         return context.get_dummy_value()
 
-    return types.void(array, Indices, Lanes), build
+    return types.void(array, Int64x8, Float64x8), build
