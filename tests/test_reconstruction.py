@@ -12,7 +12,6 @@ from vitamin3d.config import (
     DensificationConfig,
     FusionConfig,
     NltgvConfig,
-    PhotometricConfig,
     SurfaceConfig,
 )
 from vitamin3d.geometry.se3 import exp_se3, inverse
@@ -106,22 +105,6 @@ def test_views_are_kept_only_where_they_can_be_moved():
     assert Reconstruction(reference.SMALL, blocks).volumes.store is None
     assert Reconstruction(reference.SMALL, blocks, keeps_views=True).volumes.store is not None
     assert Reconstruction(reference.SMALL, CONFIG).fuse_again({}) == 0
-
-
-def test_what_pictures_contradict_is_not_fused():
-    """All pictures of these keyframes are flat or noise that no depth explains."""
-    photometric = PhotometricConfig(enabled=True, min_inverse_depth_range=0.0)
-    kept, dropped = (run(dataclasses.replace(CONFIG, photometric=p), landmarks=120)[1] for p in (PhotometricConfig(), photometric))
-    assert [(view.depth > 0).sum() for view in kept] == [(view.depth > 0).sum() for view in dropped]  # flat: nothing is said
-    noise = (noisy(snapshot, k) for k, snapshot in enumerate(snapshots(landmarks=120)))
-    views = list(Reconstruction(reference.SMALL, dataclasses.replace(CONFIG, photometric=photometric)).depth_views(noise))
-    assert len(views) == 4
-    assert sum((view.depth > 0).sum() for view in views) < 0.8 * sum((view.depth > 0).sum() for view in kept)
-
-
-def noisy(snapshot, seed):
-    image = np.random.default_rng(seed).integers(0, 255, snapshot.frame.image.shape).astype(np.uint8)
-    return dataclasses.replace(snapshot, frame=dataclasses.replace(snapshot.frame, image=image))
 
 
 def test_keyframes_without_landmarks_are_passed_over():

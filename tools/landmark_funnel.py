@@ -22,8 +22,7 @@ from vitamin3d.errors import InputError, Vitamin3dError
 from vitamin3d.exporters.files import write_file
 from vitamin3d.geometry.cameras import Camera
 from vitamin3d.localization.localizer import Localizer
-from vitamin3d.mapping.landmark_statistics import keyframe_vertices, landmark_information, landmark_statistics, relative_depth_deviations
-from vitamin3d.mapping.visible_landmarks import with_unobserved
+from vitamin3d.mapping.landmark_statistics import landmark_information, landmark_statistics, relative_depth_deviations
 from vitamin3d.slam import Slam
 from vitamin3d.slam_steps import SlamSteps
 from vitamin3d.tracking.extrema_tracking import predict_by_dense_flow
@@ -52,8 +51,6 @@ REASONS = (
     "camera jumped or lost",
 )
 MIN_FRAMES, MAX_DEVIATION, BORDER_PX = 3, 0.05, 2.0
-VISIBLE_STRIDE = 4
-"""Of the keyframes in which the landmarks in view are counted."""
 
 
 class FunnelTracker(Tracker):
@@ -187,15 +184,6 @@ def good_per_keyframe(slam: Slam) -> float:
     return float(np.median(counts)) if counts else 0.0
 
 
-def visible_per_keyframe(slam: Slam) -> float:
-    """Median number of such landmarks that a keyframe sees, those included that it does not observe and nothing nearer hides."""
-    config, counts = slam.config.snapshot, []
-    for k in range(0, slam.map.num_keyframes, VISIBLE_STRIDE):
-        vertices = with_unobserved(keyframe_vertices(slam.map, k, slam.camera, config), slam.map, k, slam.camera, config)
-        counts.append(int((vertices.relative_deviations < MAX_DEVIATION).sum()))
-    return float(np.median(counts)) if counts else 0.0
-
-
 def measure(source: Path, frames: int | None, config: Config) -> Funnel:
     """The sequence tracked and mapped, with its account."""
     dataset = open_dataset(source)
@@ -215,8 +203,6 @@ def table(columns: dict[str, Funnel]) -> str:
     lines += [f"| {stage} | " + " | ".join(f"{reached[name][stage]:,}" for name in columns) + " |" for stage in STAGES]
     good = " | ".join(f"{good_per_keyframe(funnel.slam):,.0f}" for funnel in columns.values())
     lines.append(f"| good (3 keyframes, deviation < 5 %) observed by a keyframe, median | {good} |")
-    visible = " | ".join(f"{visible_per_keyframe(funnel.slam):,.0f}" for funnel in columns.values())
-    lines.append(f"| good and in view, observed or not, none of them hidden, median | {visible} |")
     for reason in REASONS:
         shares = (funnel.tracker.ends[reason] / max(1, sum(funnel.tracker.ends.values())) for funnel in columns.values())
         lines.append(f"| tracks that ended: {reason} | " + " | ".join(f"{100 * share:.1f} %" for share in shares) + " |")

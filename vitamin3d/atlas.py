@@ -82,7 +82,7 @@ class Atlas:
         else:
             self.active = self._new_map()
             succeed(self.active, bent)
-        bent.heritage.clear()
+        bent.heritage.views.clear()
         return self.active.state
 
     def _succeed(self, front: FrontEndFrame, state: SlamState) -> SlamState:
@@ -106,7 +106,7 @@ class Atlas:
     def _begun(self, other: Slam | None, front: FrontEndFrame) -> tuple[Slam, SlamState]:
         """A new map and its state after the frame: with the tracks of one in which the camera was lost, if they reach the frame."""
         slam = self._new_map()
-        if other is None or len(other.heritage) < 2:
+        if other is None or len(other.heritage.views) < 2:
             return slam, slam.process_frame(front)
         return slam, succeed(slam, other)
 

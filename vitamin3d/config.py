@@ -501,16 +501,6 @@ class SnapshotConfig:
     """What a landmark's observations have in common does not average out: the variance of a residual times 1 + this × their number."""
     max_relative_deviation: float = 0.5
     max_reprojection_rms_px: float = 1.5
-    unobserved: bool = False
-    """Landmarks that a keyframe sees without observing them too. Off: the swept pixels are there already."""
-    occlusion_neighbours: int = 5
-    """An unobserved landmark must lie between the depths of so many observed ones around it,"""
-    occlusion_radius_px: float = 40.0
-    """all of them nearer than this,"""
-    occlusion_tolerance: float = 0.02
-    """give or take this share of the inverse depth;"""
-    max_occlusion_range: float = 0.25
-    """where their own inverse depths differ by more, nothing is said."""
 
 
 @dataclass(frozen=True)
@@ -644,27 +634,6 @@ class ConsistencyConfig:
 
 
 @dataclass(frozen=True)
-class PhotometricConfig:
-    """Before fusion, triangles that may be webs over free space must look alike in the pictures of the voters.
-
-    Off: after the votes it finds nothing more that is wrong.
-    """
-
-    enabled: bool = False
-    min_inverse_depth_range: float = 0.05
-    """A triangle is doubtful where its inverse depths differ by more, relative to their mean,"""
-    min_edge_px: float = 40.0
-    """or where its longest edge is longer."""
-    tolerance: float = 0.05
-    """What is nearer than a pixel by this share of its depth hides it."""
-    min_pixels: int = 25
-    min_contrast: float = 3.0
-    """Grey levels; nothing is said about flatter triangles."""
-    min_correlation: float = 0.4
-    """Of the second best voter."""
-
-
-@dataclass(frozen=True)
 class FusionConfig:
     """Sec. 4.2: the two TSDF volumes."""
 
@@ -742,7 +711,6 @@ class Config:
     extrapolation: ExtrapolationConfig = field(default_factory=ExtrapolationConfig)
     depth_rendering: DepthRenderingConfig = field(default_factory=DepthRenderingConfig)
     consistency: ConsistencyConfig = field(default_factory=ConsistencyConfig)
-    photometric: PhotometricConfig = field(default_factory=PhotometricConfig)
     fusion: FusionConfig = field(default_factory=FusionConfig)
     refusion: RefusionConfig = field(default_factory=RefusionConfig)
     surface: SurfaceConfig = field(default_factory=SurfaceConfig)

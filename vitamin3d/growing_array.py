@@ -37,6 +37,27 @@ class GrowingArray:
         self._data[start : self.size] = values
 
 
+class Column:
+    """An attribute of a class of growing arrays (`Columns`); reading it gives the used part, a view."""
+
+    def __init__(self, shape: tuple[int, ...], dtype: type, fill: float) -> None:
+        self.of_array, self._name = (shape, dtype, fill), ""
+
+    def __set_name__(self, owner: type, name: str) -> None:
+        self._name = name
+
+    def __get__(self, instance: "Columns", owner: type) -> Array:
+        return instance.columns[self._name].view
+
+
+class Columns:
+    """Has an array for each `Column` of its class."""
+
+    def __init__(self) -> None:
+        found = {name: column for name, column in vars(type(self)).items() if isinstance(column, Column)}
+        self.columns = {name: GrowingArray(*column.of_array) for name, column in found.items()}
+
+
 @dataclass(frozen=True)
 class IdRows:
     """The rows of ids in arrays that forget some of them now and then: those of old ids in their order, then one for each newer id."""

@@ -32,11 +32,10 @@ class Reconstruction:
         self.times = times if times is not None else StepTimes()
         self.renderer = DepthRenderer(camera, config.depth_rendering)
         steps = self.renderer, config, self.times
-        is_checked = config.consistency.enabled or config.photometric.enabled
-        self.densifying: Stage[MapSnapshot, MapSnapshot] = Chain(
-            *[Densifying(camera, *steps, num_keyframes)] if config.densification.enabled else []
-        )
-        self.meshing: Stage[MapSnapshot, DepthView] = Chain(mesher or Meshing(camera, *steps), *[Checking(*steps)] if is_checked else [])
+        densifying = [Densifying(camera, *steps, num_keyframes)] if config.densification.enabled else []
+        checking = [Checking(self.canvas, config.consistency, self.times)] if config.consistency.enabled else []
+        self.densifying: Stage[MapSnapshot, MapSnapshot] = Chain(*densifying)
+        self.meshing: Stage[MapSnapshot, DepthView] = Chain(mesher or Meshing(camera, *steps), *checking)
         self.chain: Stage[MapSnapshot, DepthView] = Chain(self.densifying, self.meshing)
         self.volumes = Volumes(self.renderer.canvas, config, self.times, keeps_views, make_volume)
 

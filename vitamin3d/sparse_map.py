@@ -10,7 +10,7 @@ import numpy as np
 
 from vitamin3d._jit import kernel
 from vitamin3d.geometry.rolling_shutter import NO_MOTION
-from vitamin3d.growing_array import GrowingArray, IdRows
+from vitamin3d.growing_array import Column, Columns, IdRows
 from vitamin3d.image.patches import PATCH_PX
 from vitamin3d.types import Array
 
@@ -52,99 +52,57 @@ def _relabel(starts, obs_landmark, obs_valid, first, new_row, is_target, count, 
                 last_new[target] = i
 
 
-class SparseMap:
-    """Keyframes (K), landmarks (L, by row) and observations (M, in keyframe order).
+OF_TRACKS = ("points_world", "first_observation", "last_observation", "num_observations", "colors", "patches")
+"""The columns that have a row for each track."""
+
+
+class SparseMap(Columns):
+    """Keyframes (K), landmarks (L, by row) and observations (M, in keyframe order); all arrays are views.
 
     Args:
         first_id: the least id of a track that it may come to know.
     """
 
+    T_cam_world = Column((4, 4), np.float64, 0.0)
+    """(K, 4, 4) poses of the keyframes."""
+    image_motions = Column(NO_MOTION.shape, np.float64, 0.0)
+    """(K, 6, 2) how the image moved when the keyframes were taken (`geometry/rolling_shutter.py`)."""
+    position_deviations_deg = Column((), np.float64, 0.0)
+    """(K,) how well the keyframes' places were known when they were taken, as angles at the median depth."""
+    obs_landmark = Column((), np.int64, -1)
+    """(M,) row of the landmark of each observation."""
+    obs_pixels = Column((2,), np.float64, np.nan)
+    """(M, 2) ideal pixels."""
+    obs_valid = Column((), np.bool_, False)
+    """(M,) bool; False: removed as an outlier."""
+    points_world = Column((3,), np.float64, np.nan)
+    """(L, 3), NaN where the track is no landmark."""
+    first_observation = Column((), np.int64, -1)
+    """(L,) index of the earliest observation that counts, -1 for none."""
+    last_observation = Column((), np.int64, -1)
+    """(L,) index of the latest observation, -1 for none."""
+    num_observations = Column((), np.int32, 0)
+    """(L,) int32 valid observations in keyframes."""
+    colors = Column((3,), np.uint8, 0)
+    """(L, 3) uint8 RGB of the latest observation."""
+    patches = Column((PATCH_PX * PATCH_PX,), np.uint8, 0)
+    """(L, 81) uint8: the 9×9 pixels around the latest observation."""
+
     def __init__(self, first_id: int = 0) -> None:
+        super().__init__()
         self._ids = IdRows(first_id)
         self.frame_indices: list[int] = []
         self.timestamps_ns: list[int] = []
         self.keyframe_starts: list[int] = [0]
-        self._poses = GrowingArray((4, 4), np.float64, 0.0)
-        self._motions = GrowingArray(NO_MOTION.shape, np.float64, 0.0)
-        self._deviations = GrowingArray((), np.float64, 0.0)
-        self._obs_landmark = GrowingArray((), np.int64, -1)
-        self._obs_pixels = GrowingArray((2,), np.float64, np.nan)
-        self._obs_valid = GrowingArray((), np.bool_, False)
-        self._points = GrowingArray((3,), np.float64, np.nan)
-        self._first = GrowingArray((), np.int64, -1)
-        self._last = GrowingArray((), np.int64, -1)
-        self._count = GrowingArray((), np.int32, 0)
-        self._colors = GrowingArray((3,), np.uint8, 0)
-        self._patches = GrowingArray((PATCH_PX * PATCH_PX,), np.uint8, 0)
 
     @property
     def num_keyframes(self) -> int:
         return len(self.frame_indices)
 
     @property
-    def T_cam_world(self) -> Array:
-        """(K, 4, 4) poses of the keyframes; a view."""
-        return self._poses.view
-
-    @property
-    def image_motions(self) -> Array:
-        """(K, 6, 2) how the image moved when the keyframes were taken (`geometry/rolling_shutter.py`); a view."""
-        return self._motions.view
-
-    @property
-    def position_deviations_deg(self) -> Array:
-        """(K,) how well the keyframes' places were known when they were taken, as angles at the median depth; a view."""
-        return self._deviations.view
-
-    @property
-    def points_world(self) -> Array:
-        """(L, 3) by row, NaN where the track is no landmark; a view."""
-        return self._points.view
-
-    @property
     def landmarks(self) -> Array:
         """(N,) rows of those that are landmarks, ascending."""
         return np.flatnonzero(~np.isnan(self.points_world[:, 0]))
-
-    @property
-    def num_observations(self) -> Array:
-        """(L,) int32 by row: valid observations in keyframes; a view."""
-        return self._count.view
-
-    @property
-    def last_observation(self) -> Array:
-        """(L,) index of the latest observation by row, -1 for none; a view."""
-        return self._last.view
-
-    @property
-    def first_observation(self) -> Array:
-        """(L,) index of the earliest observation that counts by row, -1 for none; a view."""
-        return self._first.view
-
-    @property
-    def patches(self) -> Array:
-        """(L, 81) uint8: the 9×9 pixels around the latest observation; a view."""
-        return self._patches.view
-
-    @property
-    def colors(self) -> Array:
-        """(L, 3) uint8 RGB of the latest observation; a view."""
-        return self._colors.view
-
-    @property
-    def obs_landmark(self) -> Array:
-        """(M,) row of the landmark of each observation; a view."""
-        return self._obs_landmark.view
-
-    @property
-    def obs_pixels(self) -> Array:
-        """(M, 2) ideal pixels; a view."""
-        return self._obs_pixels.view
-
-    @property
-    def obs_valid(self) -> Array:
-        """(M,) bool; False: removed as an outlier; a view."""
-        return self._obs_valid.view
 
     @property
     def obs_keyframe(self) -> Array:
@@ -202,31 +160,31 @@ class SparseMap:
         Returns:
             The index of the keyframe.
         """
-        start, rows = self._obs_landmark.size, self.rows_of(ids)
+        start, rows = len(self.obs_landmark), self.rows_of(ids)
         if rows.min(initial=0) < 0:
             rows, pixels, colors, patches = (array[rows >= 0] for array in (rows, pixels, colors, patches))
         self.frame_indices.append(frame_index)
         self.timestamps_ns.append(timestamp_ns)
-        self._poses.append(T_cam_world[None])
-        self._motions.append(image_motion[None])
-        self._deviations.append(np.array([position_deviation_deg]))
-        self._obs_landmark.append(rows)
-        self._obs_pixels.append(pixels)
-        self._obs_valid.append(np.ones(len(rows), np.bool_))
-        self.keyframe_starts.append(self._obs_landmark.size)
-        self._touch_landmarks(rows, np.arange(start, self._obs_landmark.size), colors, patches)
+        self.columns["T_cam_world"].append(T_cam_world[None])
+        self.columns["image_motions"].append(image_motion[None])
+        self.columns["position_deviations_deg"].append(np.array([position_deviation_deg]))
+        self.columns["obs_landmark"].append(rows)
+        self.columns["obs_pixels"].append(pixels)
+        self.columns["obs_valid"].append(np.ones(len(rows), np.bool_))
+        self.keyframe_starts.append(len(self.obs_landmark))
+        self._touch_landmarks(rows, np.arange(start, len(self.obs_landmark)), colors, patches)
         return self.num_keyframes - 1
 
     def _touch_landmarks(self, rows: Array, observations: Array, colors: Array, patches: Array) -> None:
         size = int(rows.max(initial=-1)) + 1
-        for array in (self._points, self._first, self._last, self._count, self._colors, self._patches):
-            array.resize(size)
-        is_new = self._first.view[rows] < 0
-        self._first.view[rows[is_new]] = observations[is_new]
-        self._last.view[rows] = observations
-        self._count.view[rows] += 1
-        self._colors.view[rows] = colors
-        self._patches.view[rows] = patches
+        for name in OF_TRACKS:
+            self.columns[name].resize(size)
+        is_new = self.first_observation[rows] < 0
+        self.first_observation[rows[is_new]] = observations[is_new]
+        self.last_observation[rows] = observations
+        self.num_observations[rows] += 1
+        self.colors[rows] = colors
+        self.patches[rows] = patches
 
     def remove_observations(self, observations: Array) -> None:
         """Marks observation indices as outliers; a landmark left with fewer than two loses its point."""
@@ -234,7 +192,7 @@ class SparseMap:
         self.obs_valid[observations] = False
         rows = self.obs_landmark[observations]
         rows = rows[(self.num_observations[rows] > 0) & (observations >= self.first_observation[rows])]
-        np.subtract.at(self._count.view, rows, 1)
+        np.subtract.at(self.num_observations, rows, 1)
         self.remove_landmarks(np.unique(rows[self.num_observations[rows] < 2]))
 
     def remove_landmarks(self, rows: Array) -> None:
@@ -242,9 +200,9 @@ class SparseMap:
 
         Observations before `first_observation` count no more, so the old ones need not be looked for.
         """
-        self._points.view[rows] = np.nan
-        self._first.view[rows] = -1
-        self._count.view[rows] = 0
+        self.points_world[rows] = np.nan
+        self.first_observation[rows] = -1
+        self.num_observations[rows] = 0
 
     def merge_landmarks(self, kept: Array, gone: Array) -> None:
         """Gives the observations of landmarks in rows `gone` (N,) to `kept` (N,), all different; where both have one, kept's stays.
@@ -255,8 +213,8 @@ class SparseMap:
         new_row, is_target = np.full(size, -1, np.int64), np.zeros(size, np.bool_)
         new_row[gone], is_target[kept] = kept, True
         better, later = self.num_observations[gone] > self.num_observations[kept], self.last_observation[gone] > self.last_observation[kept]
-        self._points.view[kept[better]] = self.points_world[gone[better]]
-        self._colors.view[kept[later]], self._patches.view[kept[later]] = self.colors[gone[later]], self.patches[gone[later]]
+        self.points_world[kept[better]] = self.points_world[gone[better]]
+        self.colors[kept[later]], self.patches[kept[later]] = self.colors[gone[later]], self.patches[gone[later]]
         count, first, last = np.zeros(size, np.int32), np.full(size, -1, np.int64), np.full(size, -1, np.int64)
         _relabel(
             np.array(self.keyframe_starts),
@@ -269,7 +227,7 @@ class SparseMap:
             first,
             last,
         )
-        self._count.view[kept], self._first.view[kept], self._last.view[kept] = count[kept], first[kept], last[kept]
+        self.num_observations[kept], self.first_observation[kept], self.last_observation[kept] = count[kept], first[kept], last[kept]
         self.remove_landmarks(gone)
 
     def condensed(self, keyframes: Array, needed_ids: Array, min_observations: int = 2, num_recent: int = 0) -> "SparseMap":
@@ -296,9 +254,9 @@ class SparseMap:
         counts &= new_row[self.obs_landmark] >= 0
         copy = self._copy_of(keyframes, counts, new_row)
         copy._ids = self._ids.keeping(self.ids_of(kept))
-        for name, array in (("_points", self._points), ("_colors", self._colors), ("_patches", self._patches)):
-            getattr(copy, name).append(array.view[known])
-        copy._points.view[~is_landmark[known]] = np.nan
+        for name in ("points_world", "colors", "patches"):
+            copy.columns[name].append(self.columns[name].view[known])
+        copy.points_world[~is_landmark[known]] = np.nan
         copy._index_observations(len(known))
         return copy
 
@@ -307,12 +265,12 @@ class SparseMap:
         copy = SparseMap()
         copy.frame_indices = [self.frame_indices[k] for k in keyframes]
         copy.timestamps_ns = [self.timestamps_ns[k] for k in keyframes]
-        copy._poses.append(self.T_cam_world[keyframes])
-        copy._motions.append(self.image_motions[keyframes])
-        copy._deviations.append(self.position_deviations_deg[keyframes])
-        copy._obs_landmark.append(new_row[self.obs_landmark[counts]])
-        copy._obs_pixels.append(self.obs_pixels[counts])
-        copy._obs_valid.append(np.ones(int(counts.sum()), np.bool_))
+        copy.columns["T_cam_world"].append(self.T_cam_world[keyframes])
+        copy.columns["image_motions"].append(self.image_motions[keyframes])
+        copy.columns["position_deviations_deg"].append(self.position_deviations_deg[keyframes])
+        copy.columns["obs_landmark"].append(new_row[self.obs_landmark[counts]])
+        copy.columns["obs_pixels"].append(self.obs_pixels[counts])
+        copy.columns["obs_valid"].append(np.ones(int(counts.sum()), np.bool_))
         before = np.concatenate([[0], np.cumsum(counts)])[self.keyframe_starts]
         copy.keyframe_starts = [0, *np.cumsum(np.diff(before)[keyframes]).tolist()]
         return copy
@@ -323,10 +281,10 @@ class SparseMap:
         count, last, first = np.bincount(self.obs_landmark, minlength=size), np.full(size, -1, np.int64), np.full(size, -1, np.int64)
         last[self.obs_landmark] = rows  # of equal indices the last assignment stays
         first[self.obs_landmark[::-1]] = rows[::-1]
-        self._count.append(count.astype(np.int32))
-        self._last.append(last)
-        self._first.append(first)
+        self.columns["num_observations"].append(count.astype(np.int32))
+        self.columns["last_observation"].append(last)
+        self.columns["first_observation"].append(first)
 
     def clone_pose(self, keyframe: int) -> Array:
         """T_cam_world (4, 4) of a keyframe, a copy."""
-        return np.array(self._poses.view[keyframe])
+        return np.array(self.T_cam_world[keyframe])

@@ -9,8 +9,8 @@ from vitamin3d.types import SlamState
 
 def succeed(slam: Slam, lost: Slam) -> SlamState:
     """A new map goes on with the newest frames and the tracks of one in which the camera was lost; at once, if these make a map."""
-    slam.tracker.continue_from(lost.heritage)
-    slam.begin(slam.initializer.try_views(lost.heritage, slam.camera))
+    slam.tracker.continue_from(lost.heritage.views)
+    slam.begin(slam.initializer.try_views(lost.heritage.views, slam.camera))
     return slam.state
 
 
@@ -20,7 +20,7 @@ def leave(slam: Slam, successor: Slam) -> bool:
     All since the successor's first frame is, frames of a turn that no landmark ended among them; and what came after the last sound
     keyframe here is nobody's. Whether anything is left.
     """
-    slam.heritage.clear()
+    slam.heritage.views.clear()
     first = successor.poses.first_frame
     keyframe = min(int(np.searchsorted(slam.map.frame_indices, first)) - 1, slam.mapper.last_sound_keyframe())
     if keyframe < 0:

@@ -240,8 +240,6 @@ class DepthView:
     """(H, W, 3) uint8 RGB (grey pictures: three equal channels)."""
     weights: Array
     """(H, W) float32 inverse variance of the depth, per squared map unit; 0 = none."""
-    doubtful: Array = field(default_factory=lambda: np.zeros((0, 0), np.int32))
-    """(H, W) int32 number of the triangle to be checked that covers a pixel, from 1; 0 = none. Empty: there are none."""
     map_number: int = 0
     """Of the map it belongs to, in the order of their births."""
 

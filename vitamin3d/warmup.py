@@ -79,8 +79,7 @@ def _everything(config: Config) -> Config:
     """The settings with what they leave out switched on."""
     calibration = dataclasses.replace(config.calibration, refine="on", first_keyframes=8)
     recovery = dataclasses.replace(config.recovery, merge_distance=0.02)
-    photometric = dataclasses.replace(config.photometric, enabled=True)
-    return dataclasses.replace(config, calibration=calibration, recovery=recovery, photometric=photometric)
+    return dataclasses.replace(config, calibration=calibration, recovery=recovery)
 
 
 def _tracked(frames: list[Frame], config: Config) -> Slam:

@@ -8,14 +8,13 @@ says how late it is; `flush` says that no more will follow. Each gives those tha
 from collections.abc import Callable, Iterable, Iterator
 from typing import Any, Generic, TypeVar
 
-from vitamin3d.config import Config
+from vitamin3d.config import Config, ConsistencyConfig
 from vitamin3d.dense.consistency import voted
 from vitamin3d.dense.delaunay import triangulate
 from vitamin3d.dense.densification import CanvasPicture, Densifier
 from vitamin3d.dense.depth_rendering import DepthRenderer
 from vitamin3d.dense.extrapolation import extended, outline
 from vitamin3d.dense.nltgv import denoise
-from vitamin3d.dense.photometric_check import marked, photometrically_checked
 from vitamin3d.dense.view_graph import Neighbourhood, ViewGraph
 from vitamin3d.dense.view_selection import ViewSelection, view_stride
 from vitamin3d.geometry.cameras import Camera
@@ -74,9 +73,7 @@ class Meshing:
             with self._times.timed("extrapolation"):
                 mesh, slopes = extended(mesh, slopes, self._border, self._config.extrapolation)
         with self._times.timed("rendering"):
-            view = self._renderer.render(item, mesh, slopes)
-        photometric = self._config.photometric
-        yield marked(view, mesh, self._renderer, photometric) if photometric.enabled else view
+            yield self._renderer.render(item, mesh, slopes)
 
     def expire(self, now_ns: int) -> Iterator[DepthView]:
         return iter(())
@@ -91,16 +88,16 @@ class Meshing:
 class Checking:
     """Leaves out of each view what those around it contradict."""
 
-    def __init__(self, renderer: DepthRenderer, config: Config, times: StepTimes) -> None:
-        self._renderer, self._config, self._times = renderer, config, times
-        self._graph: ViewGraph[DepthView] = ViewGraph(config.consistency.reach)
+    def __init__(self, canvas: Camera, config: ConsistencyConfig, times: StepTimes) -> None:
+        self._canvas, self._config, self._times = canvas, config, times
+        self._graph: ViewGraph[DepthView] = ViewGraph(config.reach)
 
     def push(self, item: DepthView) -> Iterator[DepthView]:
         yield from map(self._checked, self._graph.push(item))
         yield from self.expire(item.timestamp_ns)
 
     def expire(self, now_ns: int) -> Iterator[DepthView]:
-        wait_s = self._config.consistency.max_wait_s
+        wait_s = self._config.max_wait_s
         yield from map(self._checked, self._graph.expire(lambda view: _is_older(view.timestamp_ns, now_ns, wait_s)))
 
     def flush(self) -> Iterator[DepthView]:
@@ -110,15 +107,10 @@ class Checking:
         self._graph.clear()
 
     def _checked(self, around: Neighbourhood[DepthView]) -> DepthView:
-        consistency, photometric, view, canvas = self._config.consistency, self._config.photometric, around.item, self._renderer.canvas
+        consistency = self._config
         voters = [side[k - 1] for side in (around.before, around.after) for k in consistency.offsets if k <= len(side)]
-        if consistency.enabled:
-            with self._times.timed("consistency"):
-                view = voted(view, voters, canvas, consistency.tolerance, consistency.contradicted_weight)
-        if photometric.enabled:
-            with self._times.timed("photometric_check"):
-                view = photometrically_checked(view, voters, canvas, self._renderer.is_outside, photometric)
-        return view
+        with self._times.timed("consistency"):
+            return voted(around.item, voters, self._canvas, consistency.tolerance, consistency.contradicted_weight)
 
 
 class Chain(Generic[In, Out]):

@@ -56,11 +56,6 @@ class TsdfVolume:
         if ((view.depth > 0) & (view.depth < max_depth)).any():
             self._volume.integrate(view, canvas, max_depth)
 
-    @property
-    def can_remove(self) -> bool:
-        """Whether views can be taken out again: of `blocks` alone."""
-        return isinstance(self._volume, _WeightedBlocks)
-
     def remove(self, view: DepthView, canvas: Camera, max_depth: float) -> None:
         """Takes a view out that was integrated just so; its pose and pixels must be the same.
 

@@ -3,6 +3,7 @@
 
 from collections.abc import Iterator
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
@@ -66,20 +67,28 @@ def read_cloud_ply(path: Path) -> tuple[PointCloud, list[str]]:
     Raises:
         InputError: the file cannot be read, or is another kind of PLY.
     """
+    table, _, comments = _read_own(path, "cloud", CLOUD)
+    points, colors = (np.stack([table[n] for n in names], axis=1) for names in (POSITION, COLOR))
+    quality = (np.array(table[name]) for name in QUALITY)
+    return PointCloud(points.astype(np.float64), colors, *quality), comments
+
+
+def _read_own(path: Path, what: str, vertex: Any) -> tuple[Array, Array, list[str]]:
+    """Vertices, faces and comments of a PLY just as this file writes it; a cloud has no faces."""
     try:
         data = path.read_bytes()
     except OSError as error:
         raise InputError(f"{path}: cannot be read ({error.strerror})") from None
     header, _, body = data.partition(b"end_header\n")
     lines = header.decode("ascii", "replace").splitlines()
-    count = _element_count(lines, "vertex")
-    expected = _header(np.empty(count, CLOUD), [], []).decode().splitlines()[:-1]
-    if [line for line in lines if not line.startswith("comment ")] != expected or len(body) != count * CLOUD.itemsize:
-        raise InputError(f"{path}: not a cloud that vitamin3d wrote, or cut short; write it again")
-    table = np.frombuffer(body, CLOUD)
-    points, colors = (np.stack([table[n] for n in names], axis=1) for names in (POSITION, COLOR))
-    quality = (np.array(table[name]) for name in QUALITY)
-    return PointCloud(points.astype(np.float64), colors, *quality), [line[8:] for line in lines if line.startswith("comment ")]
+    num_vertices, num_faces = _element_count(lines, "vertex"), _element_count(lines, "face")
+    faces = [] if vertex is CLOUD else _face_lines(num_faces)
+    expected = _header(np.empty(num_vertices, vertex), [], faces).decode().splitlines()[:-1]
+    size = num_vertices * vertex.itemsize
+    if [line for line in lines if not line.startswith("comment ")] != expected or len(body) != size + num_faces * FACE.itemsize:
+        raise InputError(f"{path}: not a {what} that vitamin3d wrote, or cut short; write it again")
+    comments = [line[8:] for line in lines if line.startswith("comment ")]
+    return np.frombuffer(body[:size], vertex), np.frombuffer(body[size:], FACE), comments
 
 
 def write_obj(surface: Surface, path: Path, comments: list[str]) -> None:
@@ -101,18 +110,7 @@ def read_ply(path: Path) -> Surface:
     Raises:
         InputError: the file cannot be read, or is another kind of PLY.
     """
-    try:
-        data = path.read_bytes()
-    except OSError as error:
-        raise InputError(f"{path}: cannot be read ({error.strerror})") from None
-    header, _, body = data.partition(b"end_header\n")
-    lines = header.decode("ascii", "replace").splitlines()
-    num_vertices, num_faces = _element_count(lines, "vertex"), _element_count(lines, "face")
-    expected = _header(np.empty(num_vertices, VERTEX), [], _face_lines(num_faces)).decode().splitlines()[:-1]
-    size = num_vertices * VERTEX.itemsize
-    if [line for line in lines if not line.startswith("comment ")] != expected or len(body) != size + num_faces * FACE.itemsize:
-        raise InputError(f"{path}: not a mesh that vitamin3d wrote, or cut short; write it again")
-    vertices, faces = np.frombuffer(body[:size], VERTEX), np.frombuffer(body[size:], FACE)
+    vertices, faces, _ = _read_own(path, "mesh", VERTEX)
     points, normals, colors = (np.stack([vertices[n] for n in names], axis=1) for names in (POSITION, NORMAL, COLOR))
     return Surface(points.astype(np.float64), faces["vertex_indices"].astype(np.int32), normals.astype(np.float64), colors)
 

@@ -7,7 +7,6 @@ from vitamin3d.config import Config, WindowConfig
 from vitamin3d.geometry.cameras import Camera
 from vitamin3d.geometry.rolling_shutter import at_one_moment
 from vitamin3d.mapping.landmark_statistics import UnitInformation, keyframe_vertices
-from vitamin3d.mapping.visible_landmarks import with_unobserved
 from vitamin3d.sparse_map import SparseMap
 from vitamin3d.types import Array, Frame, MapSnapshot
 
@@ -55,9 +54,6 @@ def snapshot_of(
     Args:
         by_id: the map's `information_by_id`, for many keyframes of a map that is finished.
     """
-    at = sparse_map, keyframe, camera, config.snapshot, by_id
-    vertices = keyframe_vertices(*at)
-    if config.snapshot.unobserved:
-        vertices = with_unobserved(vertices, *at)
+    vertices = keyframe_vertices(sparse_map, keyframe, camera, config.snapshot, by_id)
     motion = sparse_map.image_motions[keyframe]
     return MapSnapshot(at_one_moment(frame, motion, camera), sparse_map.clone_pose(keyframe), *vertices, map_number)

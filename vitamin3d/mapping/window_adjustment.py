@@ -27,13 +27,11 @@ class Adjuster(Protocol):
     @property
     def is_busy(self) -> bool:
         """A task was begun and its result is not taken yet."""
-        ...
 
     def begin(self, task: Callable[[], WindowAdjustment]) -> None: ...
 
     def take(self, wait: bool = False) -> WindowAdjustment | None:
         """The result, once; None where there is none yet."""
-        ...
 
 
 class AdjustAtOnce:
