@@ -8,7 +8,7 @@ PINS    = .ci/requirements.txt
 export OMP_NUM_THREADS ?= 1
 export OMP_WAIT_POLICY ?= passive
 
-.PHONY: demo test test-fast lint docs install clean
+.PHONY: demo test test-fast lint docs figures install clean
 
 demo: $(VENV)/.installed
 	$(VENV)/bin/vitamin3d reconstruct data/demo --out $(OUT) --overwrite --scale-from-ground-truth
@@ -25,6 +25,17 @@ lint: $(VENV)/.installed-dev
 
 docs: $(VENV)/.installed-docs
 	$(VENV)/bin/mkdocs build --strict
+
+# Every figure of docs/figures.md that needs the sequences in DATA; hours.
+DATA    ?= ../shared/data
+EARLIER  = room1_v101_easy room1_v103_difficult kitchen kitti00
+figures: $(VENV)/.installed-dev
+	mkdir -p build/figures
+	$(VENV)/bin/python tools/proving_ground.py --workers 2 --json build/figures/proving_ground.json
+	for s in $(EARLIER); do $(VENV)/bin/vitamin3d reconstruct $(DATA)/$$s -o build/figures/$$s --scale-from-ground-truth --overwrite -q; \
+	  $(VENV)/bin/vitamin3d evaluate build/figures/$$s -g $(DATA)/$$s $$([ $$s = kitti00 ] || echo --surface); done
+	$(VENV)/bin/python tools/benchmark.py $(DATA)/room1_v101_easy
+	$(VENV)/bin/python tools/benchmark_bundle_adjustment.py bal $(wildcard $(DATA)/bal/*.txt.bz2)
 
 install: $(VENV)/.installed
 
