@@ -26,6 +26,19 @@ FORBIDDEN = {
     "evaluation": ("tracking", "mapping", "dense"),
 }
 """Unit -> what it must not import from `vitamin3d.`; the empty name: nothing of ours at all."""
+STEPS = ("image", "tracking", "localization", "mapping", "dense", "initialization")
+MAY_USE = {
+    "image": (),
+    "tracking": ("image",),
+    "localization": ("image",),
+    "mapping": ("image",),
+    "dense": (),
+    "initialization": ("image", "tracking", "localization", "mapping"),
+    "growing_array": (),
+    "sparse_map": ("image",),
+    "steps": (),
+}
+"""Unit -> which of the steps, besides itself, it may import from: what two of them need lies below both, or is told to them."""
 ABOVE = (
     "slam",
     "atlas",
@@ -44,6 +57,24 @@ ABOVE = (
 )
 LAZY = ("open3d", "pymeshlab")
 MAX_LINES = 60
+MAX_CLASS_LINES = 200
+ON_A_PAGE = {"slam.py": 200, "reconstruction.py": 200}
+"""Modules that are read from top to bottom, and how many lines they have at most."""
+MIRRORED = (
+    "bundle_adjustment",
+    "commands",
+    "datasets",
+    "dense",
+    "evaluation",
+    "exporters",
+    "geometry",
+    "image",
+    "initialization",
+    "localization",
+    "mapping",
+    "tracking",
+)
+TEST_FILES = [path for folder in MIRRORED for path in sorted((ROOT.parent / "tests" / folder).rglob("test_*.py"))]
 
 
 @functools.cache
@@ -70,6 +101,11 @@ def importers(*modules):
     return {name for name, path in zip(NAMES, FILES, strict=True) if {m.split(".")[0] for m in imports(tree(path))} & set(modules)}
 
 
+def of_ours(path):
+    """Names of our modules that a file imports, after `vitamin3d.`."""
+    return [m.removeprefix("vitamin3d").lstrip(".") for m in imports(tree(path)) if m.split(".")[0] == "vitamin3d"]
+
+
 def functions(path):
     return [node for node in ast.walk(tree(path)) if isinstance(node, (ast.FunctionDef, ast.AsyncFunctionDef))]
 
@@ -87,8 +123,8 @@ def test_threads_are_known_to_one_file():
 
 
 def test_heavy_libraries_are_imported_where_they_are_used():
-    sampling = "evaluation/surface_error.py"  # whose samples are to be those of other people's scripts
-    assert all(name.startswith(("dense/", "exporters/")) or name == sampling for name in importers("open3d"))
+    others = {"evaluation/surface_error.py", "datasets/point_files.py"}  # samples as in other people's scripts; the files of PCL
+    assert all(name.startswith(("dense/", "exporters/")) or name in others for name in importers("open3d"))
     assert all(name.startswith("dense/") for name in importers("pymeshlab"))
     for path in FILES:
         at_import = [node for node in tree(path).body if not isinstance(node, (ast.FunctionDef, ast.ClassDef))]
@@ -103,11 +139,18 @@ def is_type_checking(node):
 
 @pytest.mark.parametrize("path", FILES, ids=NAMES)
 def test_layers(path):
-    ours = [m.removeprefix("vitamin3d").lstrip(".") for m in imports(tree(path)) if m.split(".")[0] == "vitamin3d"]
+    ours = of_ours(path)
     for module, bad in itertools.product(ours, FORBIDDEN.get(unit(path), ())):
         assert bad and module.split(".")[0] != bad, f"{unit(path)} imports {module}"
     if unit(path) in FORBIDDEN:
         assert not {module.split(".")[0] for module in ours} & set(ABOVE)
+
+
+@pytest.mark.parametrize("name", MAY_USE)
+def test_no_step_knows_the_one_beside_it(name):
+    files = [path for path in FILES if unit(path) == name]
+    used = {module.split(".")[0] for path in files for module in of_ours(path)}
+    assert files and used & set(STEPS) <= {name, *MAY_USE[name]} and not used & set(ABOVE)
 
 
 def test_no_drawer_for_odds_and_ends():
@@ -134,6 +177,35 @@ def test_functions_fit_on_a_page():
     }
     assert len(sizes) > 200
     assert {name: size for name, size in sizes.items() if size > MAX_LINES} == {}
+
+
+def test_classes_fit_on_a_few_pages():
+    sizes = {
+        f"{name}:{node.name}": node.end_lineno - node.lineno + 1
+        for name, path in zip(NAMES, FILES, strict=True)
+        for node in ast.walk(tree(path))
+        if isinstance(node, ast.ClassDef)
+    }
+    assert len(sizes) > 100
+    assert {name: size for name, size in sizes.items() if size > MAX_CLASS_LINES} == {}
+
+
+@pytest.mark.parametrize("name", ON_A_PAGE)
+def test_what_is_read_from_top_to_bottom_is_short(name):
+    assert len((ROOT / name).read_text().splitlines()) <= ON_A_PAGE[name]
+
+
+def what_may_be_tested(folder):
+    """Modules and packages of a folder, and the functions of its `__init__.py`."""
+    init = [node.name for node in tree(folder / "__init__.py").body if isinstance(node, ast.FunctionDef)]
+    return {*init, *(path.stem for path in folder.iterdir() if path.suffix == ".py" or path.is_dir())}
+
+
+@pytest.mark.parametrize("path", TEST_FILES, ids=lambda path: f"{path.parent.name}/{path.name}")
+def test_tests_are_where_one_looks_for_them(path):
+    """test_adjust.py and test_adjust_solvers.py are about adjust.py in the folder of the same name."""
+    about, folder = path.stem.removeprefix("test_"), ROOT / path.parent.relative_to(ROOT.parent / "tests")
+    assert any(about == name or about.startswith(f"{name}_") for name in what_may_be_tested(folder))
 
 
 @pytest.mark.parametrize("path", FILES, ids=NAMES)

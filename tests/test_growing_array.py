@@ -6,7 +6,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from vitamin3d.growing_array import GrowingArray, IdRows
+from vitamin3d.growing_array import Column, Columns, GrowingArray, IdRows
 
 # --- arrays that grow ------------------------------------------------------------------------------------------------
 
@@ -49,6 +49,31 @@ def test_it_is_a_list_that_is_filled_up(steps):
             twin += [-1] * (number - len(twin))
         assert array.size == len(twin)
         np.testing.assert_array_equal(array.view, twin)
+
+
+class Table(Columns):
+    """Two columns, and an attribute that is none."""
+
+    pixels = Column((2,), np.float64, np.nan)
+    counts = Column((), np.int32, 0)
+    names = ("pixels", "counts")
+
+
+def test_a_column_reads_as_the_used_part_of_its_array():
+    table = Table()
+    assert set(table.columns) == set(Table.names) and table.pixels.shape == (0, 2) and table.counts.dtype == np.int32
+    table.columns["counts"].append(np.arange(3))
+    table.columns["pixels"].resize(2)
+    np.testing.assert_array_equal(table.counts, [0, 1, 2])
+    assert table.pixels.shape == (2, 2) and np.isnan(table.pixels).all()
+    table.counts[1] = 9
+    np.testing.assert_array_equal(table.columns["counts"].view, [0, 9, 2])
+
+
+def test_two_tables_share_nothing():
+    one, other = Table(), Table()
+    one.columns["counts"].append(np.arange(3))
+    assert len(other.counts) == 0
 
 
 # --- rows of ids -----------------------------------------------------------------------------------------------------

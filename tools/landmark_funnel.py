@@ -70,8 +70,8 @@ class FunnelTracker(Tracker):
         self.second_lives += len(np.setdiff1d(self.tracks.ids, self._known))
         self._known = self.tracks.ids
 
-    def _resume(self, followed: int | None) -> bool:
-        is_resumed = super()._resume(followed)
+    def _resume(self, front: FrontEndFrame) -> bool:
+        is_resumed = super()._resume(front)
         self.tracks = self.tracks if is_resumed else Tracks.empty()
         self._account(REASONS[7])
         return is_resumed

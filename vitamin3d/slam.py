@@ -192,10 +192,8 @@ class Slam:
 
     @property
     def camera(self) -> Camera:
-        """As the map knows it by now."""
         return self.mapper.camera
 
     @property
     def tracks(self) -> Tracks:
-        """The live ones."""
         return self.tracker.tracks

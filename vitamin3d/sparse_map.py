@@ -61,6 +61,7 @@ class SparseMap(Columns):
 
     Args:
         first_id: the least id of a track that it may come to know.
+        ids: that it knows already, instead.
     """
 
     T_cam_world = Column((4, 4), np.float64, 0.0)
@@ -88,9 +89,9 @@ class SparseMap(Columns):
     patches = Column((PATCH_PX * PATCH_PX,), np.uint8, 0)
     """(L, 81) uint8: the 9×9 pixels around the latest observation."""
 
-    def __init__(self, first_id: int = 0) -> None:
+    def __init__(self, first_id: int = 0, ids: IdRows | None = None) -> None:
         super().__init__()
-        self._ids = IdRows(first_id)
+        self.ids = ids or IdRows(first_id)
         self.frame_indices: list[int] = []
         self.timestamps_ns: list[int] = []
         self.keyframe_starts: list[int] = [0]
@@ -119,16 +120,16 @@ class SparseMap(Columns):
 
     def rows_of(self, ids: Array) -> Array:
         """(N,) rows of the tracks with these ids (N,), which may be beyond the arrays' ends; -1 for what the map has forgotten."""
-        return self._ids.of(ids)
+        return self.ids.of(ids)
 
     def ids_of(self, rows: Array) -> Array:
         """(N,) ids of the tracks in these rows (N,)."""
-        return self._ids.ids(rows)
+        return self.ids.ids(rows)
 
     @property
     def remembered_ids(self) -> Array:
         """(I,) ascending: of what came before the map last forgot something, the ids that it still knows."""
-        return self._ids.old
+        return self.ids.old
 
     def is_mapped(self, rows: Array) -> Array:
         """(N,) bool: which rows (N,) hold landmarks."""
@@ -229,61 +230,6 @@ class SparseMap(Columns):
         )
         self.num_observations[kept], self.first_observation[kept], self.last_observation[kept] = count[kept], first[kept], last[kept]
         self.remove_landmarks(gone)
-
-    def condensed(self, keyframes: Array, needed_ids: Array, min_observations: int = 2, num_recent: int = 0) -> "SparseMap":
-        """A copy with some keyframes only, and without what counts no more; rows and keyframes are numbered anew in their order.
-
-        Args:
-            keyframes: (K',) ascending, that stay.
-            needed_ids: (N,) tracks that stay whether they are landmarks or not; may be newer than any in the map.
-            min_observations: of a landmark that stays though it is neither needed nor observed in the `num_recent` newest keyframes.
-        """
-        size = len(self.points_world)
-        stays = np.zeros(self.num_keyframes, np.bool_)
-        stays[keyframes] = True
-        first = self.first_observation[self.obs_landmark]
-        counts = self.obs_valid & (first >= 0) & (np.arange(len(first)) >= first) & np.repeat(stays, np.diff(self.keyframe_starts))
-        count = np.bincount(self.obs_landmark[counts], minlength=size)
-        is_landmark = ~np.isnan(self.points_world[:, 0]) & (count >= 2)
-        is_recent = self.last_observation >= self.keyframe_starts[max(0, self.num_keyframes - num_recent)]
-        needed = self.rows_of(needed_ids)
-        kept = np.union1d(np.flatnonzero(is_landmark & (is_recent | (count >= min_observations))), needed[needed >= 0])
-        known = kept[kept < size]
-        new_row = np.full(size, -1, np.int64)
-        new_row[known] = np.arange(len(known))
-        counts &= new_row[self.obs_landmark] >= 0
-        copy = self._copy_of(keyframes, counts, new_row)
-        copy._ids = self._ids.keeping(self.ids_of(kept))
-        for name in ("points_world", "colors", "patches"):
-            copy.columns[name].append(self.columns[name].view[known])
-        copy.points_world[~is_landmark[known]] = np.nan
-        copy._index_observations(len(known))
-        return copy
-
-    def _copy_of(self, keyframes: Array, counts: Array, new_row: Array) -> "SparseMap":
-        """Some keyframes with the observations `counts` (M,) bool, rows renumbered; no landmarks yet."""
-        copy = SparseMap()
-        copy.frame_indices = [self.frame_indices[k] for k in keyframes]
-        copy.timestamps_ns = [self.timestamps_ns[k] for k in keyframes]
-        copy.columns["T_cam_world"].append(self.T_cam_world[keyframes])
-        copy.columns["image_motions"].append(self.image_motions[keyframes])
-        copy.columns["position_deviations_deg"].append(self.position_deviations_deg[keyframes])
-        copy.columns["obs_landmark"].append(new_row[self.obs_landmark[counts]])
-        copy.columns["obs_pixels"].append(self.obs_pixels[counts])
-        copy.columns["obs_valid"].append(np.ones(int(counts.sum()), np.bool_))
-        before = np.concatenate([[0], np.cumsum(counts)])[self.keyframe_starts]
-        copy.keyframe_starts = [0, *np.cumsum(np.diff(before)[keyframes]).tolist()]
-        return copy
-
-    def _index_observations(self, size: int) -> None:
-        """Counts, first and last of the observations, all of which count."""
-        rows = np.arange(len(self.obs_landmark))
-        count, last, first = np.bincount(self.obs_landmark, minlength=size), np.full(size, -1, np.int64), np.full(size, -1, np.int64)
-        last[self.obs_landmark] = rows  # of equal indices the last assignment stays
-        first[self.obs_landmark[::-1]] = rows[::-1]
-        self.columns["num_observations"].append(count.astype(np.int32))
-        self.columns["last_observation"].append(last)
-        self.columns["first_observation"].append(first)
 
     def clone_pose(self, keyframe: int) -> Array:
         """T_cam_world (4, 4) of a keyframe, a copy."""

@@ -14,6 +14,7 @@ from vitamin3d.image.corners import described_corners
 from vitamin3d.localization.localizer import Localizer
 from vitamin3d.localization.pose_log import PoseLog
 from vitamin3d.localization.rotation_tracking import unit_rays
+from vitamin3d.mapping.map_condensation import condensed
 from vitamin3d.sparse_map import SparseMap
 from vitamin3d.types import DominantFlow, Frame, FrontEndFrame, SlamState, Tracks
 
@@ -130,7 +131,7 @@ def test_pose_and_map_come_from_the_mapper_of_the_moment(scene, rng):
     """Which may have condensed its map since the last frame: ids stay, rows do not."""
     localizer, T = localizer_of(map_of(scene)), STEP @ scene.T_cam_world[7]
     localizer.mapper.map.remove_landmarks(np.arange(50))
-    localizer.mapper.map = localizer.mapper.map.condensed(np.arange(8), np.zeros(0, np.int64))
+    localizer.mapper.map = condensed(localizer.mapper.map, np.arange(8), np.zeros(0, np.int64))
     show_points(localizer, scene, T, rng)
     assert is_near(localizer.locate(front_of(71)), T) and not set(localizer.tracker.ended) & set(range(50))
 
@@ -307,6 +308,26 @@ def test_the_frames_of_a_turn_are_mended_or_given_up_when_landmarks_are_back(sce
         np.testing.assert_allclose([centres[1] - centres[0], centres[2] - centres[0]], [way / 3, 2 * way / 3], atol=0.01)
 
 
+def test_the_frames_of_a_turn_are_mended_once(scene, rng, turning):
+    localizer, show, first = turning
+    sparse_map, poses = localizer.mapper.map, []
+    for index, T, is_turn in (
+        (71, turn(2.0) @ first, True),
+        (72, STEP @ turn(2.0) @ first, False),
+        (73, turn(2.0) @ STEP @ turn(2.0) @ first, True),
+        (74, STEP @ turn(2.0) @ STEP @ turn(2.0) @ first, False),
+    ):
+        if is_turn:
+            show(T)
+        else:
+            show_points(localizer, scene, T, rng)
+        localizer.poses.add_world(front_of(index).frame, localizer.locate(front_of(index)), sparse_map)
+        assert localizer.state is (SlamState.ROTATING if is_turn else SlamState.TRACKING)
+        poses.append(localizer.poses.pose(71, sparse_map))
+    assert np.abs(poses[1] - poses[0]).max() > 0.01
+    np.testing.assert_array_equal(poses[1], poses[3])
+
+
 def test_a_new_map_knows_no_directions(turning):
     localizer, show, first = turning
     localizer.begin([])
@@ -352,6 +373,7 @@ def searching(sparse_map, pixels):
     localizer.tracker.show(9000 + np.arange(10), np.full((10, 2), 50.0))
 
     def bring(T_cam_world):
+        assert not set(localizer.tracker.tracks.ids) & set(range(9000, 9010))  # they have ended
         localizer.tracker.show(100 + np.arange(len(pixels)), pixels + SHIFT)
         return len(pixels)
 
@@ -366,7 +388,6 @@ def test_a_camera_whose_tracks_broke_is_found_by_the_pictures_of_keyframes(wall)
     for keyframe in (1, 2):
         localizer.remember(keyframe, keyframes[keyframe])
     assert is_near(localizer.locate(front), T) and localizer.state is SlamState.TRACKING
-    assert set(localizer.tracker.tracks.ids) <= set(100 + np.arange(len(pixels)))  # the broken ones have ended
     assert [gate_px for _, _, gate_px in localizer.mapper.asked] == [Config().relocalization.gate_px, None]
 
 
@@ -389,7 +410,7 @@ def test_keyframes_that_were_numbered_anew_are_still_found(wall):
     sparse_map, keyframes, pixels, front, T = wall
     localizer = searching(sparse_map, pixels)
     localizer.begin(keyframes)
-    smaller = sparse_map.condensed(np.array([1, 2]), np.zeros(0, np.int64))
+    smaller = condensed(sparse_map, np.array([1, 2]), np.zeros(0, np.int64))
     localizer.forget(np.array([1, 2]), smaller.remembered_ids)
     localizer.mapper.map, localizer.poses = smaller, localizer_of(smaller).poses
     assert is_near(localizer.locate(front), T) and localizer.state is SlamState.TRACKING

@@ -100,7 +100,6 @@ def test_pictures_without_a_clock_are_placed_somewhere_on_the_way(logged):
     assert np.linalg.norm(centres[1] - centres[0]) <= np.linalg.norm(centres[2] - centres[0])
 
 
-@pytest.mark.xfail(strict=True, reason="a slice of nothing keeps the whole picture alive")
 def test_pictures_that_wait_are_not_kept():
     repeats, picture = RepeatedPictures(), np.zeros((480, 640), np.uint8)
     kept = weakref.ref(picture)

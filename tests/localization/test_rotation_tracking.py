@@ -2,6 +2,7 @@
 """A camera that turns without travelling."""
 
 import dataclasses
+import weakref
 
 import cv2
 import numpy as np
@@ -205,6 +206,14 @@ def test_a_chain_gives_the_poses_relative_to_the_reference():
         assert kept.timestamp_ns == 50 * kept.index and kept.image.size == 0 and kept.color is None
     assert turns.since(9) == turns.since(16) == Turns().since(0) == []
     np.testing.assert_array_equal(Turns().newest, np.eye(3))
+
+
+def test_the_pictures_of_a_chain_are_not_kept():
+    turns, picture = Turns(), np.zeros((480, 640), np.uint8)
+    kept = weakref.ref(picture)
+    turns.add(Frame(10, 500, picture), np.eye(3))
+    del picture
+    assert kept() is None
 
 
 def test_a_chain_ends_at_the_reference_after_several_doubts_in_a_row():

@@ -12,6 +12,7 @@ from vitamin3d.config import BundleAdjustmentConfig, Config, WindowConfig
 from vitamin3d.geometry.se3 import exp_se3, inverse
 from vitamin3d.geometry.sim3_alignment import align_sim3
 from vitamin3d.mapping.map_adjustment import MapAdjustment
+from vitamin3d.mapping.map_condensation import condensed
 from vitamin3d.mapping.window_adjustment import AdjustAtOnce
 from vitamin3d.sparse_map import SparseMap
 from vitamin3d.types import StepTimes
@@ -180,7 +181,7 @@ def test_outliers_of_the_newest_keyframe_come_back_as_ids(scene, first_id):
 def test_ids_of_a_map_that_has_forgotten_something_are_still_ids(scene):
     sparse_map = with_outliers(scene, 5000)
     sparse_map.remove_landmarks(np.array([0, 1, 2]))
-    sparse_map = sparse_map.condensed(np.arange(8), np.zeros(0, np.int64))
+    sparse_map = condensed(sparse_map, np.arange(8), np.zeros(0, np.int64))
     assert sparse_map.rows_of(np.array([5001, 5003]))[1] == 0
     adjusting = adjustment()
     adjusting.begin_window(sparse_map, PINHOLE)

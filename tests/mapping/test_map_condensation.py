@@ -9,7 +9,7 @@ import pytest
 from vitamin3d.atlas import Atlas
 from vitamin3d.config import Config, MemoryConfig
 from vitamin3d.localization.pose_log import PoseLog
-from vitamin3d.mapping.map_condensation import condense, contributions, redundant_keyframes
+from vitamin3d.mapping.map_condensation import condense, condensed, contributions, redundant_keyframes
 from vitamin3d.runtime import RunRecord, run_sequential
 from vitamin3d.sparse_map import SparseMap
 from vitamin3d.tracking.front_end import FrontEnd
@@ -46,7 +46,7 @@ def counting(sparse_map, keyframe, id_):
 def test_what_stays_is_what_it_was(rng):
     old, needed = some_map(rng), np.array([1, 5, 20, 70])
     keyframes = np.array([0, 2, 3, 5, 8, 9, 11])
-    new = old.condensed(keyframes, needed)
+    new = condensed(old, keyframes, needed)
     kept = new.remembered_ids
     assert set(needed) <= set(kept) and (np.diff(kept) > 0).all() and len(new.points_world) == (kept < 60).sum()
     assert new.frame_indices == [10 * k for k in keyframes] and new.timestamps_ns == [1000 * k for k in keyframes]
@@ -75,7 +75,7 @@ def test_what_stays_is_what_it_was(rng):
 def test_landmarks_with_few_observations_stay_while_they_are_recent(rng):
     old = some_map(rng)
     everything, recent = np.arange(12), 3
-    kept = old.condensed(everything, np.zeros(0, np.int64), 5, recent).remembered_ids
+    kept = condensed(old, everything, np.zeros(0, np.int64), 5, recent).remembered_ids
     for id_ in np.flatnonzero(~np.isnan(old.points_world[:, 0])):
         number = sum(len(counting(old, k, id_)) for k in everything)
         stays = number >= 5 or (number >= 2 and old.keyframe_of(old.last_observation[id_]) >= 12 - recent)
@@ -115,7 +115,7 @@ def test_poses_stay_where_they_were(rng):
     before, motion = log.trajectory(made), log.predict(made)
     kept = np.array([0, 3, 4, 9, 11])
     log.move_to(kept, made)
-    smaller = made.condensed(kept, np.arange(3))
+    smaller = condensed(made, kept, np.arange(3))
     after = log.trajectory(smaller)
     np.testing.assert_array_equal(after.timestamps_ns, before.timestamps_ns)
     np.testing.assert_allclose(after.T_world_cam, before.T_world_cam, atol=1e-12)

@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 from scenes import PINHOLE, arc_scene, map_of, orbit, perturbed, project, texture, with_noise
 
+from vitamin3d.bundle_adjustment.adjust import adjust_bundle
 from vitamin3d.config import (
     BundleAdjustmentConfig,
     CalibrationConfig,
@@ -18,6 +19,7 @@ from vitamin3d.config import (
     MemoryConfig,
     MotionCheckConfig,
     RecoveryConfig,
+    WindowConfig,
 )
 from vitamin3d.geometry.se3 import exp_se3, inverse
 from vitamin3d.image.curvature import curvature
@@ -65,10 +67,10 @@ def tracks_of(ids, pixels):
     return Tracks(np.array(ids, np.int64), pixels, np.ones(n, np.float32), np.full(n, 9, np.int32), np.zeros(n, np.int32))
 
 
-def mapper_of(sparse_map, camera=PINHOLE, adjuster=None, **settings):
+def mapper_of(sparse_map, camera=PINHOLE, adjuster=None, solve=adjust_bundle, **settings):
     """A map's owner with a tracker that has no tracks yet."""
     config = dataclasses.replace(Config(), **settings)
-    mapper = Mapper(camera, Tracker(camera, config), config, MapAdjustment(config, adjuster or AdjustAtOnce(), StepTimes()))
+    mapper = Mapper(camera, Tracker(camera, config), config, MapAdjustment(config, adjuster or AdjustAtOnce(), StepTimes(), solve))
     mapper.begin(sparse_map, [front_of(index).frame for index in sparse_map.frame_indices])
     return mapper
 
@@ -125,6 +127,10 @@ def test_the_camera_of_another_map_is_inherited_and_the_tracker_has_it_too():
     mapper = mapper_of(SparseMap())
     mapper.inherit(other)
     assert mapper.camera == other.camera == mapper.tracker.camera and mapper.calibration.given == PINHOLE
+    assert mapper.wants_image_motion
+    other.calibration._reads_at_once = True  # as it may find out
+    mapper.inherit(other)
+    assert not mapper.wants_image_motion
 
 
 def test_a_refined_camera_is_the_trackers_too(rng):
@@ -334,6 +340,30 @@ def test_a_map_that_was_cut_back_goes_on(scene):
     is_mapped, rows = mapper.map.mapped(new)
     assert is_mapped.all() and mapper.map.num_keyframes == 7 and not mapper.is_bent()
     np.testing.assert_allclose(mapper.map.points_world[rows], scene.points, atol=0.01)
+
+
+def test_nothing_that_was_cut_off_is_called_sound(rng):
+    mapper = mapper_of(map_of(with_noise(arc_scene(8, 300, rng), rng, 0.3, 0.02)[0]))
+    assert mapper.last_sound_keyframe() == 7
+    mapper.become(mapper.cut_back(3))
+    assert mapper.last_sound_keyframe() == 3
+
+
+def test_with_a_smaller_map_the_adjustment_begins_without_a_past(rng):
+    priors, scene = [], arc_scene(9, 120, rng)
+
+    def solve(problem, camera, config, prior):
+        priors.append(prior)
+        return adjust_bundle(problem, camera, config, prior)
+
+    mapper = mapper_of(map_of(scene), solve=solve, window=WindowConfig(keyframes=4, past="prior"))
+    for count in (6, 8, 9):
+        mapper.map = map_of(dataclasses.replace(scene, T_cam_world=scene.T_cam_world[:count]))
+        mapper.adjustment.begin_window(mapper.map, PINHOLE)
+        mapper.take_adjustment()
+    mapper.become(mapper.cut_back(7))
+    mapper.adjustment.begin_window(mapper.map, PINHOLE)
+    assert [prior is None for prior in priors] == [True, False, False, True]
 
 
 def test_tracks_that_ended_and_are_no_landmarks_are_forgotten_once_there_are_many(scene):

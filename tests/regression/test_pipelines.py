@@ -2,6 +2,7 @@
 """The programs in `pipelines/`, on the demo."""
 
 import importlib.util
+import re
 import shutil
 from pathlib import Path
 from types import ModuleType
@@ -79,3 +80,17 @@ def test_euroc_benchmark(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> 
     assert row[0] == "V1_01_easy" and row[1].startswith("✓ 0.") and row[2] == "100.0 ± 0.0"
     assert (tmp_path / "out" / "V1_01_easy" / "0" / "report.html").is_file()
     assert pipeline("euroc_benchmark").main([str(tmp_path / "nothing"), str(tmp_path / "out")]) == 2
+
+
+def test_a_step_of_ones_own(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    """The beginning of the demo is tracked both ways."""
+    short = Path(shutil.copytree(DEMO, tmp_path / "short", ignore=shutil.ignore_patterns("depth0", "scene.ply")))
+    table = short / "mav0" / "cam0" / "data.csv"
+    table.write_text("".join(table.read_text().splitlines(keepends=True)[:71]))  # a line of names, then the pictures
+    assert pipeline("own_step").main([str(short)]) == 0
+    said = capsys.readouterr().out.splitlines()
+    found = [re.fullmatch(r"(.+): (\d+) of 70 frames localised, maps: 1, landmarks: (\d+)", line) for line in said]
+    (_, frames, landmarks), (_, frames_klt, landmarks_klt) = rows = [row.groups() for row in found if row is not None]
+    assert [name for name, *_ in rows] == ["hill climbing", "KLT"] and int(frames) >= 65 and int(frames_klt) >= 65
+    assert int(landmarks) > 1000 and int(landmarks_klt) > 1000 and landmarks != landmarks_klt
+    assert pipeline("own_step").main([]) == 2 and "python pipelines/own_step.py" in capsys.readouterr().out

@@ -6,10 +6,11 @@ import dataclasses
 import numpy as np
 import pytest
 import reference
-from scenes import EUROC, PINHOLE, view_of
+from scenes import EUROC, PINHOLE, texture, view_of, warped
 
 from vitamin3d.config import Config, ContinuityConfig, ExtremaConfig
 from vitamin3d.geometry.rolling_shutter import NO_MOTION, ideal_pixels
+from vitamin3d.tracking.front_end import FrontEnd
 from vitamin3d.tracking.tracker import Tracker, TrackIds
 from vitamin3d.types import DominantFlow, Frame, FrontEndFrame, Tracks
 
@@ -303,11 +304,34 @@ def test_of_breaks_that_are_too_long_ago_a_newer_one_is_remembered():
     assert set(tracker.tracks.ids) == newer
 
 
+def test_the_break_that_is_remembered_is_the_front_ends():
+    """Three pictures of something else each; the fourth is the second, moved."""
+    config = dataclasses.replace(Config(), continuity=ContinuityConfig(max_gap=1))
+    front_end, tracker, ids = FrontEnd(config), Tracker(CAMERA, config), []
+    pictures = [texture(240, 320, np.random.default_rng(seed), 4.0) for seed in (1, 2, 3)]
+    for index, picture in enumerate([*pictures, warped(pictures[1], np.eye(2), np.array([2.0, 0.0]))]):
+        front = front_end.process(Frame(index, index * PERIOD_NS, picture))
+        process(tracker, front)
+        ids.append(set(tracker.tracks.ids))
+    assert (front.follows == 1) == (len(ids[1] & ids[3]) > 100)
+
+
 def test_a_picture_without_tracks_is_nothing_to_come_back_to():
     tracker, ids = after_strays(90, 0)
     for index in (2, 3):
         process(tracker, film(index, None, HILLS[:0]))  # black
     process(tracker, film(4, 1, moved=3 * STEP), refills=False)
+    assert set(tracker.tracks.ids) == ids
+
+
+def test_where_there_were_no_tracks_a_later_break_is_remembered():
+    tracker = Tracker(CAMERA, Config())
+    process(tracker, film(0, None, HILLS[:0]))  # black
+    process(tracker, film(1, None))
+    process(tracker, film(2))
+    ids = set(tracker.tracks.ids)
+    process(tracker, film(3, None, HILLS[:65]))
+    process(tracker, film(4, 2, moved=2 * STEP), refills=False)
     assert set(tracker.tracks.ids) == ids
 
 

@@ -44,7 +44,10 @@ class Volumes:
 
     def fuse(self, view: DepthView) -> list[DepthView]:
         """Integrates a view into both volumes, as soon as the voxels can be chosen; the views that are in them since now."""
-        self.median_depths.append(_median_depth(view))
+        depth = _median_depth(view)
+        if np.isnan(depth):
+            return [view]  # nothing is drawn in it
+        self.median_depths.append(depth)
         self._waiting.append(dataclasses.replace(view, normals_cam=NO_NORMALS))
         fusion = self.config.fusion
         are_known = self.low is not None or (fusion.voxel_low is not None and fusion.voxel_high is not None)

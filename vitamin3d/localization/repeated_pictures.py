@@ -17,7 +17,7 @@ class RepeatedPictures:
 
     def add(self, frame: Frame) -> None:
         """A picture that says nothing about where the camera is by now."""
-        self._waiting.append(replace(frame, image=frame.image[:0], color=None))
+        self._waiting.append(replace(frame, image=frame.image[:0].copy(), color=None))
 
     def place(self, timestamp_ns: int, T_cam_world: Array | None, poses: PoseLog, sparse_map: SparseMap) -> None:
         """Logs them on the way between the camera's places before them and now; nowhere where it is not known now."""

@@ -71,7 +71,7 @@ class Turns:
     def add(self, frame: Frame, R_cam_world: Array) -> None:
         self._newest = R_cam_world
         if not self._is_ended:
-            self._frames.append((replace(frame, image=frame.image[:0], color=None), R_cam_world))
+            self._frames.append((replace(frame, image=frame.image[:0].copy(), color=None), R_cam_world))
 
     def has_turned(self, config: RotationConfig) -> bool:
         """Whether the camera has turned by more than a hand's shake, in more than a few frames."""

@@ -20,7 +20,7 @@ class KeyframeHandover:
     def __init__(self, window: WindowConfig) -> None:
         self.window = window
         self.num_kept = max(UNTAKEN_KEYFRAMES, UNTAKEN_WINDOWS * window.keyframes)
-        """So many of the newest keyframes wait at most."""
+        """So many of the newest keyframes wait at most, those of a new map apart."""
         self._frames: dict[int, Frame] = {}
 
     def begin(self, frames: list[Frame]) -> None:

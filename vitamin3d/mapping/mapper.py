@@ -16,7 +16,7 @@ from vitamin3d.mapping.landmark_recovery import recover_landmarks, same_landmark
 from vitamin3d.mapping.landmark_statistics import UnitInformation
 from vitamin3d.mapping.landmark_triangulation import Rigidity, triangulate_landmarks
 from vitamin3d.mapping.map_adjustment import MapAdjustment
-from vitamin3d.mapping.map_condensation import Condensation, condense, is_due
+from vitamin3d.mapping.map_condensation import Condensation, condense, condensed, is_due
 from vitamin3d.mapping.motion_check import MotionCheck
 from vitamin3d.mapping.readout_estimation import set_image_motion
 from vitamin3d.sparse_map import SparseMap
@@ -178,7 +178,7 @@ class Mapper:
         self.tracker.end_all()
         self._meetings = []
         kept = np.arange(keyframe + 1)
-        return Condensation(self.map.condensed(kept, np.zeros(0, np.int64)), kept)
+        return Condensation(condensed(self.map, kept, np.zeros(0, np.int64)), kept)
 
     def become(self, done: Condensation) -> None:
         """Takes a smaller map; keyframes are numbered anew."""

@@ -65,7 +65,7 @@ class Tracker:
         Returns:
             Where it was measured: time stamp (ns) of the frame before, and its image motion (6, 2) as the mean of before and after it.
         """
-        if front.follows != self.newest_frame and not self._resume(front.follows):
+        if front.follows != self.newest_frame and not self._resume(front):
             self.image_motion, self._last_ns = NO_MOTION, front.frame.timestamp_ns
             self.tracks = Tracks.empty()
             return None
@@ -82,14 +82,14 @@ class Tracker:
         """The tracks at the maxima near where they are predicted (N, 2)."""
         return track_extrema(self.tracks, predicted, front.kappa, self.config.extrema_tracking)
 
-    def _resume(self, followed: int | None) -> bool:
+    def _resume(self, front: FrontEndFrame) -> bool:
         """Takes the tracks up again from before a break, if that is the frame followed; keeps those there are where none is."""
-        index, tracks, last_ns = self._before_break
+        followed, (index, tracks, last_ns) = front.follows, self._before_break
         if followed is not None and followed == index:
             self.tracks, self._last_ns = tracks, last_ns
             self._before_break = -1, Tracks.empty(), 0
             return True
-        is_over = index < 0 or self.newest_frame - index > self.config.continuity.max_gap
+        is_over = index < 0 or front.frame.index - index > self.config.continuity.max_gap
         if followed is None and len(self.tracks) and is_over:
             self._before_break = self.newest_frame, self.tracks, self._last_ns
         return False
