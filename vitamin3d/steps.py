@@ -14,19 +14,7 @@ from vitamin3d.bundle_adjustment.problem import BundleProblem
 from vitamin3d.config import BundleAdjustmentConfig
 from vitamin3d.geometry.cameras import Camera
 from vitamin3d.sparse_map import SparseMap
-from vitamin3d.types import (
-    Array,
-    BundleReport,
-    DepthView,
-    Frame,
-    FrontEndFrame,
-    MapSnapshot,
-    SlamState,
-    StepTimes,
-    Surface,
-    TrackedView,
-    Tracks,
-)  # fmt: skip
+from vitamin3d.types import Array, BundleReport, DepthView, Frame, FrontEndFrame, MapSnapshot, SlamState, Surface, TrackedView, Tracks
 
 
 class LandmarkTracker(Protocol):
@@ -134,8 +122,6 @@ class LandmarkMapper(Protocol):
 
 class PixelFrontEnd(Protocol):
     """What needs pixels only, ahead of the map; `vitamin3d.tracking.front_end.FrontEnd`."""
-
-    times: StepTimes
 
     def process(self, frame: Frame) -> FrontEndFrame:
         """Curvature, its extrema, and the flow from the picture that this one continues."""

@@ -1,9 +1,14 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Clouds and meshes of any system: PLY, PCD, OBJ, and text (`MapPoints.txt`, xyz), as numbers and without a library."""
+"""Clouds and meshes of any system: PLY, PCD, OBJ, and text (`MapPoints.txt`, xyz).
 
+PCD is read by Open3D 0.19. PLY and OBJ are not: it ends the process at a polygon whose corner is not there, gives up a mesh for one
+flat or bent polygon, returns what was never written for an OBJ with lines, and prints of PLY whatever its verbosity.
+"""
+
+import re
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeAlias
 
 import numpy as np
 
@@ -12,11 +17,12 @@ from vitamin3d.types import Array
 
 SUFFIXES = (".ply", ".pcd", ".obj", ".txt", ".xyz", ".csv", ".asc", ".pts")
 PLY_TYPES = {
-    **dict.fromkeys(("char", "int8"), "i1"), **dict.fromkeys(("uchar", "uint8"), "u1"), **dict.fromkeys(("short", "int16"), "i2"),
-    **dict.fromkeys(("ushort", "uint16"), "u2"), **dict.fromkeys(("int", "int32"), "i4"), **dict.fromkeys(("uint", "uint32"), "u4"),
-    **dict.fromkeys(("float", "float32"), "f4"), **dict.fromkeys(("double", "float64"), "f8"),
+    "char": "i1", "uchar": "u1", "short": "i2", "ushort": "u2", "int": "i4", "uint": "u4", "float": "f4", "double": "f8",
+    "int8": "i1", "uint8": "u1", "int16": "i2", "uint16": "u2", "int32": "i4", "uint32": "u4", "float32": "f4", "float64": "f8",
 }  # fmt: skip
-PLY_ORDERS = {"binary_little_endian": "<", "binary_big_endian": ">", "ascii": ""}
+Property: TypeAlias = tuple[str, "np.dtype[Any]", "np.dtype[Any] | None"]
+"""Of a PLY: its name, type, and the type of the length where it is a list."""
+PLY_ORDERS = {"binary_little_endian": "<", "binary_big_endian": ">", "ascii": "<"}
 FAR = 30.0
 """A point farther from the middle than this many times the 90th percentile of all is an outlier."""
 MOST_OUTLIERS = 0.02
@@ -41,6 +47,7 @@ class Geometry:
         return len(self.triangles) > 0
 
 
+@np.errstate(invalid="ignore", over="ignore")  # of a damaged file any number may come
 def read_geometry(path: Path) -> Geometry:
     """A cloud or mesh without its outlying points.
 
@@ -56,7 +63,7 @@ def read_geometry(path: Path) -> Geometry:
         raise InputError(f"{path}: cannot be read ({error.strerror}); check the path") from None
     try:
         read = reader(path, data)
-    except (ValueError, IndexError, KeyError, UnicodeDecodeError, OverflowError):
+    except (ValueError, LookupError, OverflowError, RuntimeError, MemoryError):
         raise InputError(f"{path}: damaged or cut short; export it again") from None
     if len(read.points) == 0:
         raise InputError(f"{path}: an empty cloud; give a file with points")
@@ -88,109 +95,62 @@ def _kept(geometry: Geometry, keep: Array) -> Geometry:
 NO_TRIANGLES = np.zeros((0, 3), np.int64)
 
 
-# --- PLY -------------------------------------------------------------------------------------------------------------
-
-
-@dataclass
-class _Element:
-    """A table of a PLY: `vertex`, `face` or another."""
-
-    name: str
-    count: int
-    properties: list[tuple[str, str, str]]
-    """Name, type, and the type of the length for a list, else empty."""
-
-
 def _read_ply(path: Path, data: bytes) -> Geometry:
-    header, _, body = data.partition(b"end_header")
+    head, _, body = data.partition(b"end_header")
     if not data.startswith(b"ply") or not body:
         raise InputError(f"{path}: not a PLY file; name it by its format, or export it again")
-    order, elements = _ply_header(path, header.decode("ascii", "replace").splitlines())
-    body = body[body.index(b"\n") + 1 :]
-    tables = _ply_text(body, elements) if order == "" else _ply_binary(body, elements, order)
-    if "vertex" not in tables or not {"x", "y", "z"} <= set(tables["vertex"]):
+    tables = _ply_tables([line.split() for line in head.decode("ascii", "replace").splitlines()], body.partition(b"\n")[2])
+    vertex = tables.get("vertex", {})
+    if not {"x", "y", "z"} <= set(vertex):
         raise InputError(f"{path}: no vertices with x, y and z; export it again")
-    vertex = tables["vertex"]
     points = np.stack([vertex[c] for c in "xyz"], axis=1).astype(np.float64)
     faces = next((column for name, column in tables.get("face", {}).items() if name.startswith("vertex_ind")), NO_TRIANGLES)
     return Geometry(points, _checked(faces, len(points)), _colors(vertex))
 
 
-def _ply_header(path: Path, lines: list[str]) -> tuple[str, list[_Element]]:
-    order, elements = None, list[_Element]()
-    for words in (line.split() for line in lines):
-        if words[:1] == ["format"]:
-            order = PLY_ORDERS[words[1]]
-        elif words[:1] == ["element"]:
-            elements.append(_Element(words[1], int(words[2]), []))
-        elif words[:2] == ["property", "list"]:
-            elements[-1].properties.append((words[4], PLY_TYPES[words[3]], PLY_TYPES[words[2]]))
+def _ply_tables(head: list[list[str]], body: bytes) -> dict[str, dict[str, Array]]:
+    """Columns by the names of element and property. Text is read as if it were binary: all numbers are float64."""
+    form = {words[0]: words[1] for words in head if len(words) > 1}["format"]
+    order, is_text = PLY_ORDERS[form], form == "ascii"
+    body = np.array(body.split(), "<f8").tobytes() if is_text else body
+    elements = list[tuple[str, int, list[Property]]]()
+    for words in head:
+        if words[:1] == ["element"]:
+            elements.append((words[1], int(words[2]), []))
         elif words[:1] == ["property"]:
-            elements[-1].properties.append((words[2], PLY_TYPES[words[1]], ""))
-    if order is None or not elements:
-        raise InputError(f"{path}: a PLY without a header that is known; export it again")
-    return order, elements
-
-
-def _ply_binary(body: bytes, elements: list[_Element], order: str) -> dict[str, dict[str, Array]]:
-    tables, start = {}, 0
-    for element in elements:
-        lists = [p for p in element.properties if p[2]]
-        if not lists:
-            kind = np.dtype([(name, order + code) for name, code, _ in element.properties])
-            rows = np.frombuffer(body, kind, element.count, start)
-            start += kind.itemsize * element.count
-            tables[element.name] = {name: rows[name] for name, *_ in element.properties}
-        elif element.name == "face" or element is not elements[-1]:
-            tables[element.name], start = _ply_lists(body, element, order, start)
+            codes = [PLY_TYPES[word] for word in words[-2:0:-1] if word != "list"]
+            types = [np.dtype("<f8" if is_text else order + code) for code in codes]
+            elements[-1][2].append((words[-1], types[0], types[1] if words[1] == "list" else None))
+    tables, start = dict[str, dict[str, Array]](), 0
+    for name, count, properties in elements:
+        tables[name], start = _ply_rows(body, start, count, properties)
+    if start > len(body) or (is_text and start < len(body)):
+        raise ValueError("more or fewer numbers than declared")
     return tables
 
 
-def _ply_lists(body: bytes, element: _Element, order: str, start: int) -> tuple[dict[str, Array], int]:
-    """Rows with lists: at once where all lists are triangles, else row by row, larger polygons as fans."""
-    fields: list[Any] = []
-    for name, code, length in element.properties:
-        fields += [(f"{name} count", order + length), (name, order + code, (3,))] if length else [(name, order + code)]
-    kind = np.dtype(fields)
-    if start + kind.itemsize * element.count <= len(body):
-        rows = np.frombuffer(body, kind, element.count, start)
-        if all((rows[f"{name} count"] == 3).all() for name, _, length in element.properties if length):
-            return {name: rows[name] for name, *_ in element.properties}, start + kind.itemsize * element.count
-    fans, position = list[list[int]](), start
-    for _ in range(element.count):
-        for name, code, length in element.properties:
-            count = 1
-            if length:
-                count = int(np.frombuffer(body, order + length, 1, position)[0])
-                position += np.dtype(length).itemsize
-            values = np.frombuffer(body, order + code, count, position)
-            position += np.dtype(code).itemsize * count
-            fans += _fan(values.tolist()) if name.startswith("vertex_ind") else []
-    return {"vertex_indices": np.array(fans, np.int64).reshape(-1, 3)}, position
+def _ply_rows(body: bytes, start: int, count: int, properties: list[Property]) -> tuple[dict[str, Array], int]:
+    """An element's columns and where it ends: at once where all lists are triangles, else row by row, larger polygons as fans."""
+    fields, lists = list[Any](), [name for name, _, length in properties if length is not None]
+    for name, kind, length in properties:
+        fields += [(name, kind)] if length is None else [(f"# {name}", length), (name, kind, (3,))]
+    row = np.dtype(fields)
+    if not lists or start + row.itemsize * count <= len(body):
+        rows = np.frombuffer(body, row, count, start)
+        if all((rows[f"# {name}"] == 3).all() for name in lists):
+            return {name: rows[name] for name, *_ in properties}, start + row.itemsize * count
+    fans = list[list[int]]()
+    for _ in range(count):
+        for name, kind, length in properties:
+            size = 1 if length is None else int(np.frombuffer(body, length, 1, start)[0])
+            start += 0 if length is None else length.itemsize
+            fans += _fan(np.frombuffer(body, kind, size, start).tolist()) if name.startswith("vertex_ind") else []
+            start += kind.itemsize * size
+    return {"vertex_indices": np.array(fans, np.int64).reshape(-1, 3)}, start
 
 
 def _fan(polygon: list[int]) -> list[list[int]]:
     return [[polygon[0], polygon[k], polygon[k + 1]] for k in range(1, len(polygon) - 1)]
-
-
-def _ply_text(body: bytes, elements: list[_Element]) -> dict[str, dict[str, Array]]:
-    rows, start = [line for line in body.splitlines() if line.strip()], 0
-    tables: dict[str, dict[str, Array]] = {}
-    for element in elements:
-        mine = rows[start : start + element.count]
-        if len(mine) < element.count:
-            raise ValueError("cut short")
-        if any(length for *_, length in element.properties):
-            polygons = [[int(float(word)) for word in row.split()] for row in mine]
-            fans = [triangle for row in polygons for triangle in _fan(row[1 : 1 + row[0]])]
-            tables[element.name] = {element.properties[0][0]: np.array(fans, np.int64).reshape(-1, 3)}
-        elif mine:
-            values = np.array([row.split()[: len(element.properties)] for row in mine], np.float64)
-            tables[element.name] = {name: values[:, k] for k, (name, *_) in enumerate(element.properties)}
-        else:
-            tables[element.name] = {name: np.zeros(0) for name, *_ in element.properties}
-        start += element.count
-    return tables
 
 
 def _colors(vertex: dict[str, Array]) -> Array | None:
@@ -203,82 +163,35 @@ def _colors(vertex: dict[str, Array]) -> Array | None:
 
 
 def _checked(triangles: Array, count: int) -> Array:
-    triangles = np.asarray(triangles, np.int64).reshape(-1, 3)
     if len(triangles) and not (triangles.min() >= 0 and triangles.max() < count):
         raise ValueError("a triangle of a vertex that is not there")
-    return triangles
-
-
-# --- PCD -------------------------------------------------------------------------------------------------------------
+    return triangles.astype(np.int64)
 
 
 def _read_pcd(path: Path, data: bytes) -> Geometry:
-    head = data[: data.index(b"\n", data.index(b"DATA ")) + 1]
-    fields = {words[0]: words[1:] for words in (line.split() for line in head.decode("ascii", "replace").splitlines()) if words}
-    names, count = fields["FIELDS"], int(fields["POINTS"][0])
-    kinds = [f"{ {'F': 'f', 'U': 'u', 'I': 'i'}[t] }{size}" for t, size in zip(fields["TYPE"], fields["SIZE"], strict=True)]
-    repeats = [int(n) for n in fields.get("COUNT", ["1"] * len(names))]
-    body, how = data[len(head) :], fields["DATA"][0]
-    dtype = np.dtype([(f"{name} {k}", kind, (repeat,)) for k, (name, kind, repeat) in enumerate(zip(names, kinds, repeats, strict=True))])
-    if how == "ascii":
-        rows = np.array([line.split() for line in body.splitlines() if line.strip()][:count], np.float64)
-        starts = np.cumsum([0, *repeats])
-        columns = {name: rows[:, starts[k]] for k, name in enumerate(names)} if len(rows) else {name: np.zeros(0) for name in names}
-    elif how == "binary":
-        table = np.frombuffer(body, dtype, count)
-        columns = {name: table[f"{name} {k}"][:, 0] for k, name in enumerate(names)}
-    else:
-        columns = _pcd_compressed(body, names, kinds, repeats, count)
-    if not {"x", "y", "z"} <= set(columns):
-        raise InputError(f"{path}: no fields x, y and z; export it again")
-    return Geometry(np.stack([columns[c] for c in "xyz"], axis=1).astype(np.float64), NO_TRIANGLES, None)
+    head, _, body = data.partition(b"\nDATA ")
+    count = int(re.findall(rb"^POINTS +(\d+)", head, re.MULTILINE)[0])
+    if body.startswith(b"ascii") and len(np.array([row.split() for row in body.splitlines()[1:] if row.strip()], np.float64)) < count:
+        raise ValueError("cut short, or no numbers: Open3D does not say so")
+    import open3d as o3d
 
-
-def _pcd_compressed(body: bytes, names: list[str], kinds: list[str], repeats: list[int], count: int) -> dict[str, Array]:
-    """PCL's `binary_compressed`: the columns one after the other, packed by LZF."""
-    packed, size = (int(n) for n in np.frombuffer(body, "<u4", 2))
-    raw, columns, start = _lzf(body[8 : 8 + packed], size), {}, 0
-    for name, kind, repeat in zip(names, kinds, repeats, strict=True):
-        columns[name] = np.frombuffer(raw, kind, count * repeat, start)[::repeat]
-        start += np.dtype(kind).itemsize * count * repeat
-    return columns
-
-
-def _lzf(packed: bytes, size: int) -> bytes:
-    out, k = bytearray(), 0
-    while k < len(packed):
-        control = packed[k]
-        k += 1
-        if control < 32:  # so many bytes as they are, and one
-            out += packed[k : k + control + 1]
-            k += control + 1
-            continue
-        length = control >> 5  # a copy of what came before
-        if length == 7:
-            length += packed[k]
-            k += 1
-        start = len(out) - ((control & 31) << 8) - packed[k] - 1
-        k += 1
-        for n in range(length + 2):
-            out.append(out[start + n])
-    if len(out) != size:
-        raise ValueError("cut short")
-    return bytes(out)
-
-
-# --- OBJ and text ----------------------------------------------------------------------------------------------------
+    with o3d.utility.VerbosityContextManager(o3d.utility.VerbosityLevel.Error):
+        found = o3d.t.io.read_point_cloud(str(path)).point
+    points = found["positions"].numpy() if "positions" in found else np.zeros((0, 3))
+    if len(points) != count:
+        raise InputError(f"{path}: damaged, cut short, or without x, y and z; export it again")
+    return Geometry(points.astype(np.float64), NO_TRIANGLES, found["colors"].numpy() if "colors" in found else None)
 
 
 def _read_obj(path: Path, data: bytes) -> Geometry:
     points, triangles = [], list[list[int]]()
-    for line in data.decode("ascii", "replace").splitlines():
-        words = line.split()
+    for words in (line.split() for line in data.decode("ascii", "replace").splitlines()):
         if words[:1] == ["v"]:
             points.append([float(word) for word in words[1:4]])
         elif words[:1] == ["f"]:
             corners = [int(word.split("/")[0]) for word in words[1:]]
             triangles += _fan([c - 1 if c > 0 else len(points) + c for c in corners])
-    return Geometry(np.array(points, np.float64).reshape(-1, 3), _checked(np.array(triangles).reshape(-1, 3), len(points)))
+    return Geometry(np.array(points, np.float64).reshape(-1, 3), _checked(np.array(triangles, np.int64).reshape(-1, 3), len(points)))
 
 
 def _read_text(path: Path, data: bytes) -> Geometry:
