@@ -51,7 +51,7 @@ class Atlas:
 
     def _tracked(self, front: FrontEndFrame) -> SlamState:
         if self._is_false(self.active):
-            self.active.take_adjustment(wait=True)
+            self.active.mapper.take_adjustment(wait=True)
             self.active = self._new_map()
         state = self.active.process_frame(front)
         is_held = state not in (SlamState.LOST, SlamState.ROTATING) or self.active.map.num_keyframes == 0
@@ -59,7 +59,7 @@ class Atlas:
         if is_held:
             self._keep_successor_ready(front)
             return state
-        self.active.take_adjustment(wait=True)  # both maps may have one adjuster, and it does one thing at a time
+        self.active.mapper.take_adjustment(wait=True)  # both maps may have one adjuster, and it does one thing at a time
         return self._take_over(front) if self.active.is_bent else self._succeed(front, state)
 
     def _keep_successor_ready(self, front: FrontEndFrame) -> None:
@@ -67,9 +67,9 @@ class Atlas:
         if self.successor is None or self._frames_held > self.config.atlas.frames_beside:
             self.successor = None
             return
-        self.active.take_adjustment(wait=True)
+        self.active.mapper.take_adjustment(wait=True)
         state = self.successor.process_frame(front)
-        self.successor.take_adjustment(wait=True)
+        self.successor.mapper.take_adjustment(wait=True)
         if state is SlamState.LOST or self._is_false(self.successor):
             self.successor = None
 
@@ -91,7 +91,7 @@ class Atlas:
             self.successor, state = self._begun(self.active, front)
         else:
             state = self.successor.process_frame(front)
-        self.successor.take_adjustment(wait=True)
+        self.successor.mapper.take_adjustment(wait=True)
         if state is SlamState.LOST or self._is_false(self.successor):
             self.successor, state = self._begun(self.successor if state is SlamState.LOST else None, front)
         if state is SlamState.TRACKING and self._has_held(self.successor):
@@ -145,7 +145,7 @@ class Atlas:
 
     def take_adjustment(self, wait: bool = False) -> None:
         """The window that was adjusted meanwhile enters the active map."""
-        self.active.take_adjustment(wait)
+        self.active.mapper.take_adjustment(wait)
 
     @property
     def adjustments_awaited(self) -> int:

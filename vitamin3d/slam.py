@@ -152,10 +152,6 @@ class Slam:
 
     # --- what leaves -------------------------------------------------------------------------------------------------
 
-    def take_adjustment(self, wait: bool = False) -> None:
-        """The window that was adjusted meanwhile enters the map."""
-        self.mapper.take_adjustment(wait)
-
     def finish(self) -> None:
         """The adjustment of the whole map at the end of a recording; the poses of all frames move along."""
         if self.map.num_keyframes:

@@ -7,7 +7,7 @@ import cv2
 import numpy as np
 
 from vitamin3d._jit import kernel
-from vitamin3d.errors import InputError, OutputError
+from vitamin3d.errors import OutputError
 from vitamin3d.exporters.files import write_file
 from vitamin3d.types import Array
 
@@ -21,21 +21,6 @@ def write_depth_map(depth: Array, path: Path, counts_per_unit: float) -> None:
         OutputError: the file cannot be written.
     """
     write_png(counts_from_depth(depth, counts_per_unit), path)
-
-
-def read_depth_map(path: Path, counts_per_unit: float) -> Array:
-    """Depth (H, W) float32 in map units, 0 = none, of a file of `write_depth_map`.
-
-    Raises:
-        InputError: not a 16-bit PNG.
-    """
-    try:
-        counts = cv2.imdecode(np.frombuffer(path.read_bytes(), np.uint8), cv2.IMREAD_UNCHANGED)
-    except (OSError, cv2.error):
-        counts = None
-    if counts is None or counts.dtype != np.uint16 or counts.ndim != 2:
-        raise InputError(f"{path}: not a depth map (16-bit grey PNG) that vitamin3d wrote")
-    return np.asarray(counts.astype(np.float32) / np.float32(counts_per_unit))
 
 
 def counts_from_depth(depth: Array, counts_per_unit: float) -> Array:
