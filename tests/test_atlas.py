@@ -9,7 +9,7 @@ import pytest
 
 from vitamin3d.atlas import Atlas
 from vitamin3d.config import AtlasConfig, Config
-from vitamin3d.geometry.cameras import Camera
+from vitamin3d.geometry.cameras import PinholeCamera
 from vitamin3d.geometry.sim3_alignment import align_sim3
 from vitamin3d.localization.localizer import Localizer
 from vitamin3d.mapping.landmark_triangulation import Rigidity
@@ -313,7 +313,7 @@ def test_a_pose_without_known_landmarks_adds_nothing_to_the_map(demo, plain):
 def test_the_next_map_begins_with_the_refined_camera(demo, plain, flipped):
     eager = dataclasses.replace(Config(), calibration=dataclasses.replace(Config().calibration, refine="on", first_keyframes=6))
     wrong = dataclasses.replace(demo.camera, fx=1.02 * demo.camera.fx, fy=1.02 * demo.camera.fy)
-    assert isinstance(wrong, Camera)
+    assert isinstance(wrong, PinholeCamera)
     front_end, atlas = FrontEnd(eager), Atlas(wrong, eager)
     for index, picture in enumerate(plain[:80] + flipped[80:83]):
         atlas.process_frame(front_end.process(Frame(index, index * PERIOD_NS, picture)))

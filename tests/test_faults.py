@@ -12,10 +12,12 @@ from vitamin3d.cli import main
 from vitamin3d.commands.process import ONE_THREAD_EACH
 from vitamin3d.datasets.base import PictureSequence
 from vitamin3d.datasets.trajectories import read_tum
+from vitamin3d.dense.stages import Meshing
+from vitamin3d.dense.volumes import Volumes
 from vitamin3d.exporters.mesh import read_ply
 from vitamin3d.exporters.output_folder import OutputFolder
-from vitamin3d.reconstruction import Reconstruction
-from vitamin3d.slam import Slam
+from vitamin3d.localization.localizer import Localizer
+from vitamin3d.mapping.map_adjustment import MapAdjustment
 from vitamin3d.tracking.front_end import FrontEnd
 
 pytestmark = [
@@ -28,10 +30,10 @@ WAYS = {"live": ["--live"], "live sequential": ["--live", "--sequential"], "thre
 FAULTS = {
     "reading": (PictureSequence, "read", FRAME, "reading picture 100"),
     "front end": (FrontEnd, "process", FRAME, "curvature and flow of frame 100"),
-    "tracking": (Slam, "_localize", FRAME - 30, "tracking and mapping frame"),
-    "adjusting": (Slam, "_solved", KEYFRAME, "mapping"),
-    "meshing": (Reconstruction, "depth_view", KEYFRAME, "meshing"),
-    "fusing": (Reconstruction, "fuse", KEYFRAME, "fusing"),
+    "tracking": (Localizer, "locate", FRAME - 30, "tracking and mapping frame"),
+    "adjusting": (MapAdjustment, "_solved", KEYFRAME, "mapping"),
+    "meshing": (Meshing, "push", KEYFRAME, "meshing"),
+    "fusing": (Volumes, "fuse", KEYFRAME, "fusing"),
     "writing": (OutputFolder, "write_view", KEYFRAME, ""),
 }
 """What breaks: class, method, at which call, and what the message names."""

@@ -30,7 +30,7 @@ def test_observations_are_stored_by_keyframe():
     assert (sparse_map.frame_indices, sparse_map.timestamps_ns) == ([0, 10], [0, 10**9])
     np.testing.assert_array_equal(sparse_map.obs_landmark, [3, 0, 0, 5, 3])
     np.testing.assert_array_equal(sparse_map.obs_pixels, np.vstack([pixels_0, pixels_1]))
-    np.testing.assert_array_equal(sparse_map.obs_keyframe, [0, 0, 1, 1, 1])
+    np.testing.assert_array_equal(sparse_map.keyframe_of(np.arange(len(sparse_map.obs_landmark))), [0, 0, 1, 1, 1])
     np.testing.assert_array_equal(sparse_map.obs_pixels[sparse_map.observations_of(1)], pixels_1)
     np.testing.assert_array_equal(sparse_map.num_observations, [2, 0, 0, 2, 0, 1])
     np.testing.assert_array_equal(sparse_map.first_observation, [1, -1, -1, 0, -1, 3])
@@ -53,8 +53,7 @@ def test_keyframe_of_is_the_keyframe_of_each_observation():
     sparse_map = SparseMap()
     for ids in ([0, 1], [], [2], [0, 1, 2]):
         add(sparse_map, ids)
-    np.testing.assert_array_equal(sparse_map.keyframe_of(np.arange(6)), sparse_map.obs_keyframe)
-    np.testing.assert_array_equal(sparse_map.obs_keyframe, [0, 0, 2, 3, 3, 3])
+    np.testing.assert_array_equal(sparse_map.keyframe_of(np.arange(len(sparse_map.obs_landmark))), [0, 0, 2, 3, 3, 3])
 
 
 def test_a_track_is_mapped_once_it_has_a_point():

@@ -105,11 +105,6 @@ class SparseMap(Columns):
         """(N,) rows of those that are landmarks, ascending."""
         return np.flatnonzero(~np.isnan(self.points_world[:, 0]))
 
-    @property
-    def obs_keyframe(self) -> Array:
-        """(M,) keyframe of each observation."""
-        return np.repeat(np.arange(self.num_keyframes), np.diff(self.keyframe_starts))
-
     def keyframe_of(self, observations: Array) -> Array:
         """Keyframe of observation indices (N,)."""
         return np.asarray(np.searchsorted(self.keyframe_starts, observations, side="right") - 1)

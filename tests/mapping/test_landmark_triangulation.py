@@ -84,7 +84,8 @@ def test_rigidity_counts_no_landmark_that_disagrees_between(scene):
     sparse_map, rigidity = map_of(scene, with_points=False), Rigidity()
     newest = sparse_map.obs_landmark[sparse_map.observations_of(7)]
     sliding = np.isin(sparse_map.obs_landmark, newest[:20])
-    sparse_map.obs_pixels[sliding & (sparse_map.obs_keyframe > 1) & (sparse_map.obs_keyframe < 7)] += [6.0, 0.0]
+    keyframes = sparse_map.keyframe_of(np.arange(len(sliding)))
+    sparse_map.obs_pixels[sliding & (keyframes > 1) & (keyframes < 7)] += [6.0, 0.0]
     made = triangulate_landmarks(sparse_map, PINHOLE, TriangulationConfig(), rigidity)
     assert made == len(newest) - 20 and (rigidity.num_tracks, rigidity.num_rigid) == (len(newest), made)
 

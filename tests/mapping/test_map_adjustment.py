@@ -192,7 +192,7 @@ def test_outliers_leave_the_map_wherever_they_were_seen(scene):
     sparse_map, adjusting = with_outliers(scene), adjustment()
     adjusting.begin_window(sparse_map, PINHOLE)
     adjusting.take(sparse_map, PINHOLE)
-    removed = {(int(sparse_map.obs_keyframe[row]), int(sparse_map.obs_landmark[row])) for row in np.flatnonzero(~sparse_map.obs_valid)}
+    removed = {(int(sparse_map.keyframe_of(row)), int(sparse_map.obs_landmark[row])) for row in np.flatnonzero(~sparse_map.obs_valid)}
     assert removed == {(7, 3), (7, 40), (4, 42)}
     np.testing.assert_allclose(sparse_map.points_world[[3, 40, 42]], scene.points[[3, 40, 42]], atol=0.02)
 

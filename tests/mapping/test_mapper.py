@@ -188,7 +188,7 @@ def test_every_few_keyframes_the_window_is_adjusted_and_its_outliers_end(scene):
         ended.append(sorted({8, 9, 10, 11} - set(mapper.tracker.tracks.ids)))
     assert times == [1, 1, 2, 2] and ended == [[8], [], [10], []]
     rows = np.flatnonzero(~mapper.map.obs_valid)
-    assert {(int(mapper.map.obs_keyframe[row]), int(mapper.map.obs_landmark[row])) for row in rows} == {(8, 8), (9, 9), (10, 10)}
+    assert {(int(mapper.map.keyframe_of(row)), int(mapper.map.obs_landmark[row])) for row in rows} == {(8, 8), (9, 9), (10, 10)}
 
 
 def test_what_was_begun_beside_the_tracking_is_waited_for(scene, rng):

@@ -46,7 +46,7 @@ def test_a_bend_before_both_keyframes_is_not_seen_and_harms_neither(rng):
 def test_with_few_shared_landmarks_there_is_no_opinion(rng):
     sparse_map = arc_map(rng, num_points=300)
     assert second_opinion(sparse_map, PINHOLE, dataclasses.replace(CONFIG, min_pairs=301)) is None
-    newest = np.flatnonzero(sparse_map.obs_keyframe == 9)
+    newest = np.flatnonzero(sparse_map.keyframe_of(np.arange(len(sparse_map.obs_landmark))) == 9)
     sparse_map.obs_valid[newest[40:]] = False
     assert second_opinion(sparse_map, PINHOLE, CONFIG) is None
     assert second_opinion(sparse_map, PINHOLE, dataclasses.replace(CONFIG, min_pairs=20)) is not None
@@ -55,8 +55,8 @@ def test_with_few_shared_landmarks_there_is_no_opinion(rng):
 def test_tracks_that_are_no_landmarks_have_no_say(rng):
     """What moves by itself must not bend a map, be it the majority."""
     sparse_map, moved = arc_map(rng), inverse(BEND)
-    for row in np.flatnonzero((sparse_map.obs_landmark < 200) & (sparse_map.obs_keyframe >= 6)):
-        T = sparse_map.T_cam_world[sparse_map.obs_keyframe[row]] @ moved
+    for row in np.flatnonzero((sparse_map.obs_landmark < 200) & (sparse_map.keyframe_of(np.arange(len(sparse_map.obs_landmark))) >= 6)):
+        T = sparse_map.T_cam_world[sparse_map.keyframe_of(row)] @ moved
         sparse_map.obs_pixels[row] = project(PINHOLE, T, sparse_map.points_world[sparse_map.obs_landmark[row]][None])[0]
     assert second_opinion(sparse_map, PINHOLE, CONFIG).cost_ratio > 1.5
     sparse_map.remove_landmarks(np.arange(200))
