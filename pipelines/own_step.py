@@ -3,17 +3,18 @@
 
     python pipelines/own_step.py data/demo
 
-Whatever has the methods of a protocol in `vitamin3d/steps.py` can take a step's place; here a class that inherits all but one of them.
+Whatever has the methods of a protocol in `vitamin3d/steps.py` can take a step's place; here a class that inherits most of them.
 """
 
 import sys
+from collections.abc import Sequence
 from pathlib import Path
 
 import cv2
 import numpy as np
 
 from vitamin3d import Atlas, Config, FrontEnd, SlamSteps, Tracker, Unreadable, open_dataset
-from vitamin3d.types import Array, FrontEndFrame, Tracks
+from vitamin3d.types import Array, FrontEndFrame, TrackedView, Tracks
 
 SETTINGS = {"winSize": (15, 15), "maxLevel": 3, "minEigThreshold": 1e-3}
 
@@ -23,12 +24,22 @@ class KltTracker(Tracker):
 
     _before: Array | None = None
     """The picture that the newest one continues."""
+    _pictures: dict[int, Array]
+    """Of the newest frames, one of which the next picture may continue."""
 
     def follow(self, front: FrontEndFrame, measures_motion: bool) -> tuple[int, Array] | None:
         """As of `Tracker`; the picture is kept for the next one."""
+        self._pictures = getattr(self, "_pictures", {})
+        self._before = self._pictures.get(-1 if front.follows is None else front.follows)
         result = super().follow(front, measures_motion)
-        self._before = front.frame.image
+        self._pictures[front.frame.index] = front.frame.image
+        self._pictures.pop(front.frame.index - self.config.continuity.max_gap - 1, None)
         return result
+
+    def continue_from(self, views: Sequence[TrackedView]) -> None:
+        """With the pictures of the map in which the camera was lost."""
+        super().continue_from(views)
+        self._pictures = {view.frame.index: view.frame.image for view in views}
 
     def climb(self, predicted: Array, front: FrontEndFrame) -> Tracks:
         """The tracks (N) that KLT finds, from where dense flow predicts them (N, 2), in both directions."""

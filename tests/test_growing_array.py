@@ -99,8 +99,8 @@ class Remembered:
 
 
 def check(rows, twin):
-    every_id, by_id = np.arange(twin.next), twin.rows()
-    np.testing.assert_array_equal(rows.of(every_id), [by_id.get(id_, -1) for id_ in range(twin.next)])
+    every_id, by_row = np.arange(twin.next), twin.rows()
+    np.testing.assert_array_equal(rows.of(every_id), [by_row.get(id_, -1) for id_ in range(twin.next)])
     np.testing.assert_array_equal(rows.ids(np.arange(len(twin.by_row))), twin.by_row)
 
 

@@ -8,7 +8,7 @@
 The steps run one after the other on one thread and are timed by that thread's CPU, so that other load on the machine
 matters little; the processor's caches it still shares. The sparse half runs first (its scale from the ground truth, where
 there is one: the paper's voxels are 15 and 2.5 cm), then the dense half over its keyframes. In every frame KLT tracks as
-many points as are alive, forward only; at every tenth keyframe the window is also solved by the Schur complement alone. The
+many points as are alive, forward only; of every fifth window the window is also solved by the Schur complement alone. The
 volumes' time is that of fusing one view and extracting the whole surface: the median over ten times in the course of the run,
 and the last time, "at the end".
 """
@@ -43,7 +43,7 @@ from vitamin3d.exporters.files import write_file
 from vitamin3d.exporters.line_plot import Axes, Line, line_plot
 from vitamin3d.geometry.cameras import Camera
 from vitamin3d.map_output import with_voxels
-from vitamin3d.mapping.landmark_statistics import information_by_id
+from vitamin3d.mapping.landmark_statistics import information_by_row
 from vitamin3d.reconstruction import Reconstruction
 from vitamin3d.run_statistics import step_table, versions
 from vitamin3d.scale import Scale, scale_from_ground_truth
@@ -148,13 +148,13 @@ def run_dense(dataset: Dataset, made: Measured, config: Config, scale: Scale) ->
     reconstruction = Reconstruction(made.slam.camera, with_voxels(config, scale), num_keyframes=made.slam.map.num_keyframes)
     reconstruction.times.clock = time.thread_time
     begun = time.thread_time()
-    by_id, count = information_by_id(made.slam.map, made.slam.camera), made.slam.map.num_keyframes
+    by_row, count = information_by_row(made.slam.map, made.slam.camera), made.slam.map.num_keyframes
     extra_seconds = 0.0
     for keyframe, index in enumerate(made.slam.map.frame_indices):
         frame = dataset.read(index)
         if not isinstance(frame, Unreadable):
             with reconstruction.times.timed("snapshot"):
-                snapshot = made.slam.snapshot(keyframe, frame, by_id)
+                snapshot = made.slam.snapshot(keyframe, frame, by_row)
             reconstruction.add_keyframe(snapshot)
         if keyframe % (1 + count // EXTRACTIONS) == count // EXTRACTIONS and reconstruction.volumes.low is not None:
             extra_seconds += extraction_seconds(reconstruction)

@@ -16,6 +16,8 @@ import numba
 ROOT = Path(__file__).parent
 STAMP = "inlined.sha1"
 """In `__pycache__`: of which inlined functions the kernels beside it were compiled."""
+CALLED_BY_KERNELS = b"@inlined", b"@intrinsic", b"def solve_6x6"
+"""What a file has that holds functions which kernels of other files call."""
 _Function = TypeVar("_Function", bound=Callable[..., Any])
 
 
@@ -36,7 +38,7 @@ def kernels_are_cached() -> bool:
 
 
 def forget_stale_kernels(root: Path = ROOT) -> None:
-    """Removes the compiled kernels beside a package when a file with inlined functions is another one than it was: numba does not see that.
+    """Removes the compiled kernels beside a package when a file whose functions they call has changed: numba does not see that.
 
     After an update of the checkout they would hold the old functions, or ask for modules that are gone. Nothing happens where files cannot
     be written: then they are not cached here either.
@@ -44,7 +46,7 @@ def forget_stale_kernels(root: Path = ROOT) -> None:
     sources = [(path, path.read_bytes()) for path in sorted(root.rglob("*.py"))]
     digest = hashlib.sha1(usedforsecurity=False)
     for path, text in sources:
-        if b"@inlined" in text:
+        if any(word in text for word in CALLED_BY_KERNELS):
             digest.update(str(path.relative_to(root)).encode() + text)
     stamp = root / "__pycache__" / STAMP
     with contextlib.suppress(OSError):

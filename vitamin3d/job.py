@@ -15,7 +15,7 @@ from vitamin3d.datasets.pictures import Unreadable
 from vitamin3d.errors import InputError
 from vitamin3d.exporters.output_folder import MapFolder, OutputFolder
 from vitamin3d.map_output import MapOutput, MapOutputs
-from vitamin3d.mapping.landmark_statistics import information_by_id
+from vitamin3d.mapping.landmark_statistics import information_by_row
 from vitamin3d.run_gaps import Gap, find_gaps, gaps_table, no_map_sentence
 from vitamin3d.run_report import write_report
 from vitamin3d.run_statistics import Stopwatch, live_table, map_table, run_statistics
@@ -179,11 +179,11 @@ class _JobRun:
     def _snapshots(self) -> Iterator[MapSnapshot]:
         """The keyframes of the finished maps, their pictures read again."""
         for _, slam in self._ranked():
-            by_id = information_by_id(slam.map, slam.camera)
+            by_row = information_by_row(slam.map, slam.camera)
             for keyframe, frame_index in enumerate(slam.map.frame_indices):
                 frame = self.dataset.read(frame_index)
                 if not isinstance(frame, Unreadable):
-                    yield slam.snapshot(keyframe, frame, by_id)
+                    yield slam.snapshot(keyframe, frame, by_row)
 
     def _keyframe_done(self, output: MapOutput, view: DepthView) -> None:
         done = 0

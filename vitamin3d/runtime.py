@@ -22,7 +22,7 @@ from vitamin3d.datasets.base import Dataset
 from vitamin3d.datasets.pictures import Unreadable
 from vitamin3d.mapping.window_adjustment import AdjustAtOnce, WindowAdjustment
 from vitamin3d.slam import Slam
-from vitamin3d.tracking.front_end import FrontEnd
+from vitamin3d.steps import PixelFrontEnd
 from vitamin3d.types import Array, Frame, FrontEndFrame, MapSnapshot, NewestFrame, SlamState
 from vitamin3d.workers import BackgroundTask, Clock, Consumer, ReadAhead, step
 
@@ -147,7 +147,7 @@ class _Run:
 def run_sequential(
     dataset: Dataset,
     indices: range,
-    front_end: FrontEnd,
+    front_end: PixelFrontEnd,
     atlas: Atlas,
     sink: SnapshotSink | None = None,
     observer: Observer | None = None,
@@ -171,7 +171,7 @@ def run_sequential(
 def run_threaded(
     dataset: Dataset,
     indices: range,
-    front_end: FrontEnd,
+    front_end: PixelFrontEnd,
     atlas: Atlas,
     sink: SnapshotSink | None = None,
     observer: Observer | None = None,
@@ -188,7 +188,7 @@ def run_threaded(
 def run_live(
     dataset: Dataset,
     indices: range,
-    front_end: FrontEnd,
+    front_end: PixelFrontEnd,
     atlas: Atlas,
     consume: SnapshotConsumer | None = None,
     observer: Observer | None = None,
@@ -241,7 +241,7 @@ def _pictures(dataset: Dataset, indices: range) -> Iterator[Frame | Unreadable]:
 
 
 def _front_frames(
-    pictures: Iterable[Frame | Unreadable], front_end: FrontEnd, record: RunRecord, clock: Clock | None = None
+    pictures: Iterable[Frame | Unreadable], front_end: PixelFrontEnd, record: RunRecord, clock: Clock | None = None
 ) -> Iterator[FrontEndFrame | Unreadable]:
     for picture in pictures:
         if isinstance(picture, Unreadable):
@@ -257,7 +257,7 @@ def _front_frames(
 
 
 def _fronts_ahead(
-    threads: ExitStack, pictures: Iterator[Frame | Unreadable], front_end: FrontEnd, record: RunRecord, clock: Clock | None = None
+    threads: ExitStack, pictures: Iterator[Frame | Unreadable], front_end: PixelFrontEnd, record: RunRecord, clock: Clock | None = None
 ) -> ReadAhead:
     decoded = threads.enter_context(ReadAhead(pictures, "decoding", READ_AHEAD))
     return ReadAhead(_front_frames(decoded, front_end, record, clock), "front-end", READ_AHEAD, upstream=decoded)

@@ -162,12 +162,12 @@ class Slam:
         """The keyframes that settled since the last call (or all that remain), each once, with their frames."""
         return self.mapper.handover.take_settled(self.map.num_keyframes, self.tracker.newest_frame, everything)
 
-    def snapshot(self, keyframe: int, frame: Frame, by_id: UnitInformation | None = None) -> MapSnapshot:
+    def snapshot(self, keyframe: int, frame: Frame, by_row: UnitInformation | None = None) -> MapSnapshot:
         """A keyframe with the depths of its landmarks as the map has them now; its picture as if read at one moment.
 
-        `by_id` is the map's `information_by_id`, for many keyframes of a map that is finished.
+        `by_row` is the map's `information_by_row`, for many keyframes of a map that is finished.
         """
-        return self.mapper.snapshot(keyframe, frame, self.number, by_id)
+        return self.mapper.snapshot(keyframe, frame, self.number, by_row)
 
     def trajectory(self) -> Trajectory:
         """Camera-to-world poses of all localised frames."""

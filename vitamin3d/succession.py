@@ -1,17 +1,29 @@
 # SPDX-License-Identifier: Apache-2.0
 """From one map to the next: what the map that follows begins with, and what the one that is left keeps."""
 
+from dataclasses import replace
+
 import numpy as np
 
+from vitamin3d.geometry.cameras import Camera
+from vitamin3d.geometry.rolling_shutter import ideal_pixels
 from vitamin3d.slam import Slam
-from vitamin3d.types import SlamState
+from vitamin3d.types import SlamState, TrackedView
 
 
 def succeed(slam: Slam, lost: Slam) -> SlamState:
     """A new map goes on with the newest frames and the tracks of one in which the camera was lost; at once, if these make a map."""
-    slam.tracker.continue_from(lost.heritage.views)
-    slam.begin(slam.initializer.try_views(lost.heritage.views, slam.camera))
+    views = [_seen_by(slam.camera, view) for view in lost.heritage.views]
+    slam.tracker.continue_from(views)
+    slam.begin(slam.initializer.try_views(views, slam.camera))
     return slam.state
+
+
+def _seen_by(camera: Camera, view: TrackedView) -> TrackedView:
+    """The view with the ideal pixels of a camera that may be another one than when it was tracked: that was refined since."""
+    pixels = ideal_pixels(view.tracks.pixels, view.image_motion, camera)
+    valid = np.isfinite(pixels[:, 0])
+    return replace(view, tracks=view.tracks.select(valid), ideal_pixels=pixels[valid])
 
 
 def leave(slam: Slam, successor: Slam) -> bool:

@@ -132,7 +132,7 @@ def fused(count=3, **settings):
 
 def test_views_whose_keyframe_is_elsewhere_by_now_are_taken_out_and_fused_anew():
     volumes, made = fused()
-    assert volumes.fuse_again({0: np.eye(4), 1: SHIFT}) == 1  # 2 has none
+    assert volumes.fuse_again({0: np.eye(4), 1: SHIFT, 2: np.eye(4)}) == 1
     for volume in made:
         ((out, limit),), (again, limit_again) = volume.removed, volume.integrated[3]
         view, limit_before = volume.integrated[1]
@@ -144,6 +144,13 @@ def test_views_whose_keyframe_is_elsewhere_by_now_are_taken_out_and_fused_anew()
         np.testing.assert_array_equal(out.T_cam_world, np.eye(4))
         np.testing.assert_array_equal(again.T_cam_world, SHIFT)
     assert len(volumes.times.milliseconds["refusion"]) == 1
+
+
+def test_views_whose_keyframe_the_map_has_given_up_go():
+    volumes, made = fused()
+    assert volumes.fuse_again({0: np.eye(4), 1: np.eye(4)}) == 1
+    for volume in made:
+        assert [view.timestamp_ns for view, _ in volume.removed] == [2] and len(volume.integrated) == 3
 
 
 def test_what_moved_by_less_than_a_voxels_share_stays():

@@ -10,7 +10,7 @@ from scenes import PINHOLE, map_of, project, with_noise
 from vitamin3d.config import Config, SnapshotConfig, WindowConfig
 from vitamin3d.geometry.rolling_shutter import at_one_moment
 from vitamin3d.mapping.keyframe_handover import KeyframeHandover, snapshot_of
-from vitamin3d.mapping.landmark_statistics import information_by_id
+from vitamin3d.mapping.landmark_statistics import information_by_row
 from vitamin3d.types import Frame
 
 CONFIG = dataclasses.replace(Config(), snapshot=SnapshotConfig(min_observations=1, max_reprojection_rms_px=9.0))
@@ -151,8 +151,8 @@ def test_what_was_removed_or_is_no_landmark_is_no_vertex(scene):
 
 def test_what_is_known_of_the_whole_map_need_not_be_counted_again(scene, rng):
     sparse_map = map_of(with_noise(scene, rng, 0.5, 0.0)[0])
-    by_id = information_by_id(sparse_map, PINHOLE)
-    one, other = (snapshot_of(sparse_map, 2, frame(20), PINHOLE, CONFIG, 0, known) for known in (None, by_id))
+    by_row = information_by_row(sparse_map, PINHOLE)
+    one, other = (snapshot_of(sparse_map, 2, frame(20), PINHOLE, CONFIG, 0, known) for known in (None, by_row))
     for name in ("pixels", "depths", "relative_deviations"):
         np.testing.assert_allclose(getattr(one, name), getattr(other, name), rtol=1e-12)
 

@@ -369,11 +369,11 @@ def test_with_a_smaller_map_the_adjustment_begins_without_a_past(rng):
 def test_tracks_that_ended_and_are_no_landmarks_are_forgotten_once_there_are_many(scene):
     sparse_map = map_of(scene)
     sparse_map.points_world[200:] = np.nan
-    mapper = mapper_of(sparse_map, memory=MemoryConfig(max_new_tracks=50), adjuster=Late())
+    mapper = mapper_of(sparse_map, memory=MemoryConfig(max_new_tracks=400), adjuster=Late())
     see(mapper, scene, scene.T_cam_world[7], [*range(100), *range(250, 300)])
-    mapper.tracker.num_born = 50
+    mapper.tracker.num_born = 400
     assert mapper.condensed_when_due() is None
-    mapper.tracker.num_born, before = 51, points_by_id(mapper.map)
+    mapper.tracker.num_born, before = 401, points_by_id(mapper.map)
     mapper.adjustment.begin_window(mapper.map, PINHOLE)
     done = mapper.condensed_when_due()
     assert not mapper.is_adjusting  # its rows are those of the map before
@@ -382,7 +382,7 @@ def test_tracks_that_ended_and_are_no_landmarks_are_forgotten_once_there_are_man
     np.testing.assert_array_equal(mapper.map.rows_of(np.arange(200, 250)), -1)
     np.testing.assert_array_equal(mapper.map.rows_of(np.arange(250, 300)), np.arange(200, 250))
     np.testing.assert_array_equal(done.kept_keyframes, np.arange(8))
-    mapper.tracker.num_born = 102
+    mapper.tracker.num_born = 802
     assert mapper.condensed_when_due() is not None and len(mapper.times.milliseconds["condense"]) == 2
 
 

@@ -60,7 +60,7 @@ class BundleProblem:
     point_order: Array
     """(M,) int64."""
     landmark_ids: Array
-    """(P,) int64."""
+    """(P,) int64, whose points these are: rows of the map, where they come from one."""
     obs_rows: Array
     """(M,) int64, index of the observation in the map; -1: of the frame that is no keyframe."""
 

@@ -161,6 +161,8 @@ def staged(messages: Iterable[Any], stage_of: Callable[[int], Stage[Any, Any]]) 
                 yield from newest.flush()
             newest = here
             yield from here.push(message)
+            if isinstance(message, MapSnapshot):
+                yield from here.expire(message.frame.timestamp_ns)
         elif newest is not None:
             yield from newest.expire(message.timestamp_ns)
             yield message

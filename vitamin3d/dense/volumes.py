@@ -25,7 +25,7 @@ class Volumes:
     Args:
         canvas: camera of the views.
         keeps_views: fused views are kept, so that `fuse_again` can move them; where the settings and the volume allow it.
-        make_volume: of voxels of this side in map units; None: as the settings name it.
+        make_volume: of voxels of this side in map units, able to `remove` where views are kept; None: as the settings name it.
     """
 
     def __init__(
@@ -46,7 +46,7 @@ class Volumes:
         """Integrates a view into both volumes, as soon as the voxels can be chosen; the views that are in them since now."""
         depth = _median_depth(view)
         if np.isnan(depth):
-            return [view]  # nothing is drawn in it
+            return []  # nothing is drawn in it
         self.median_depths.append(depth)
         self._waiting.append(dataclasses.replace(view, normals_cam=NO_NORMALS))
         fusion = self.config.fusion
@@ -91,26 +91,25 @@ class Volumes:
         """Moves the views in the volumes whose keyframe is elsewhere by now; how many.
 
         Args:
-            poses: T_cam_world (4, 4) by time stamp (ns); views without one stay.
+            poses: T_cam_world (4, 4) by time stamp (ns); views without one go: the map has given up their keyframes.
         """
         self.fuse_waiting()
         if self.store is None or self.low is None or self.high is None:
             return 0
         least = self.config.refusion.min_motion_voxels * self.high.voxel_length
-        moved = {kept.timestamp_ns for kept in self.store.headers() if self._motion(kept, poses) > least}
+        moved = {k.timestamp_ns for k in self.store.headers() if k.timestamp_ns not in poses or self._motion(k, poses) > least}
         for view in self.store.views(moved):
             with self.times.timed("refusion"):
-                at_new_pose = dataclasses.replace(view, T_cam_world=poses[view.timestamp_ns])
                 for volume in (self.low, self.high):
                     volume.remove(view, self.canvas, np.inf)
-                    volume.integrate(at_new_pose, self.canvas, np.inf)
+                    if view.timestamp_ns in poses:
+                        at_new_pose = dataclasses.replace(view, T_cam_world=poses[view.timestamp_ns])
+                        volume.integrate(at_new_pose, self.canvas, np.inf)
         self.store.close()
         return len(moved)
 
     def _motion(self, kept: Packed, poses: Mapping[int, Array]) -> float:
         """The farthest, in map units, that a corner of the picture at the view's middle depth moved in the world."""
-        if kept.timestamp_ns not in poses:
-            return 0.0
         right, bottom = self.canvas.width - 1.0, self.canvas.height - 1.0
         corners = self.canvas.rays_from_ideal(np.array([[0.0, 0.0], [right, 0.0], [0.0, bottom], [right, bottom]])) * kept.middle_depth
         here, there = (inverse(T) for T in (kept.T_cam_world, poses[kept.timestamp_ns]))

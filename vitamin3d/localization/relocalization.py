@@ -66,7 +66,7 @@ def landmark_matches(
     corners: tuple[Array, Array], keyframe: int, described: tuple[Array, Array], sparse_map: SparseMap, camera: Camera,
     config: RelocalizationConfig,
 ) -> tuple[Array, Array]:  # fmt: skip
-    """Landmarks (N,) ids of a keyframe and rows (N,) of the frame's corners that match them.
+    """Landmarks (N,), their rows in the map, of a keyframe and rows (N,) of the frame's corners that match them.
 
     Args:
         corners: of the frame, from `described_corners`.
@@ -75,8 +75,8 @@ def landmark_matches(
     none = np.zeros(0, np.int64), np.zeros(0, np.int64)
     pixels, descriptors = described
     rows = sparse_map.observations_of(keyframe)
-    ids = sparse_map.obs_landmark[rows]
-    usable = sparse_map.obs_valid[rows] & sparse_map.is_mapped(ids)
+    landmarks = sparse_map.obs_landmark[rows]
+    usable = sparse_map.obs_valid[rows] & sparse_map.is_mapped(landmarks)
     if len(pixels) == 0 or len(corners[0]) == 0 or not usable.any():
         return none
     distances, nearest = cKDTree(sparse_map.obs_pixels[rows][usable]).query(np.nan_to_num(camera.undistort(pixels), nan=-1e6))
@@ -84,7 +84,7 @@ def landmark_matches(
     if len(lent) == 0:
         return none
     pairs = mutual_matches(descriptors[lent], corners[1])
-    return ids[usable][nearest[lent[pairs[:, 0]]]], pairs[:, 1]
+    return landmarks[usable][nearest[lent[pairs[:, 0]]]], pairs[:, 1]
 
 
 def relocalize(
@@ -99,10 +99,10 @@ def relocalize(
     corners = described_corners(frame.image, config.corners)
     found = [landmark_matches(corners, k, described, sparse_map, camera, config) for k, described in keyframes]
     pairs = np.concatenate([np.zeros((0, 2), np.int64), *(np.column_stack(pair) for pair in found)])
-    ids, rows = np.unique(pairs, axis=0).T  # what several keyframes say counts once
+    landmarks, rows = np.unique(pairs, axis=0).T  # what several keyframes say counts once
     pixels = camera.undistort(corners[0][rows])
     valid = np.isfinite(pixels[:, 0])
-    return localize(sparse_map.points_world[ids[valid]], pixels[valid], None, camera, localization, frame.index)
+    return localize(sparse_map.points_world[landmarks[valid]], pixels[valid], None, camera, localization, frame.index)
 
 
 def is_search_due(num_lost: int, config: RelocalizationConfig) -> bool:

@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """The calibration refined while mapping: real ones are wrong by percents, and the map pays for it.
 
-Each time the map has grown by half, the camera's parameters join an adjustment of the whole map. Tracks that a wrong
+Each time the map has grown by a factor, the camera's parameters join an adjustment of the whole map. Tracks that a wrong
 calibration contradicts are cut short, so that the first refinements see too little of the error: later ones correct them.
 """
 

@@ -47,13 +47,13 @@ class KeyframeHandover:
 
 
 def snapshot_of(
-    sparse_map: SparseMap, keyframe: int, frame: Frame, camera: Camera, config: Config, map_number: int, by_id: UnitInformation | None
+    sparse_map: SparseMap, keyframe: int, frame: Frame, camera: Camera, config: Config, map_number: int, by_row: UnitInformation | None
 ) -> MapSnapshot:
     """A keyframe with the depths of its landmarks as the map has them now; its picture as if read at one moment.
 
     Args:
-        by_id: the map's `information_by_id`, for many keyframes of a map that is finished.
+        by_row: the map's `information_by_row`, for many keyframes of a map that is finished.
     """
-    vertices = keyframe_vertices(sparse_map, keyframe, camera, config.snapshot, by_id)
+    vertices = keyframe_vertices(sparse_map, keyframe, camera, config.snapshot, by_row)
     motion = sparse_map.image_motions[keyframe]
     return MapSnapshot(at_one_moment(frame, motion, camera), sparse_map.clone_pose(keyframe), *vertices, map_number)

@@ -88,7 +88,7 @@ def _deviate(information, points, poses, out):  # type: ignore[no-untyped-def]
 
 @dataclass(frozen=True)
 class LandmarkStatistics:
-    """By landmark id; zeros for tracks that are no landmarks."""
+    """By row; zeros for tracks that are no landmarks."""
 
     num_observations: Array
     """(L,) int32, in keyframes."""
@@ -124,9 +124,9 @@ def _widest_angles(sparse_map: SparseMap) -> Array:
     return np.asarray(np.degrees(np.arccos(np.clip(low, -1.0, 1.0))))
 
 
-def landmark_information(sparse_map: SparseMap, ids: Array, camera: Camera, config: SnapshotConfig) -> Array:
-    """Inverse covariance (N, 3, 3) of landmarks (N,) ids, in the world."""
-    information, squared, count = unit_information(sparse_map, ids, camera)
+def landmark_information(sparse_map: SparseMap, landmarks: Array, camera: Camera, config: SnapshotConfig) -> Array:
+    """Inverse covariance (N, 3, 3) of landmarks (N,) rows, in the world."""
+    information, squared, count = unit_information(sparse_map, landmarks, camera)
     return np.asarray(information / observation_variances(squared, count, config)[:, None, None])
 
 
@@ -159,11 +159,12 @@ class UnitInformation(NamedTuple):
         return UnitInformation(self.information[chosen], self.squared[chosen], self.counts[chosen])
 
 
-def unit_information(sparse_map: SparseMap, ids: Array, camera: Camera) -> UnitInformation:
-    """What the observations in keyframes say about landmarks (N,) ids; one pass over all observations of the map."""
+def unit_information(sparse_map: SparseMap, landmarks: Array, camera: Camera) -> UnitInformation:
+    """What the observations in keyframes say about landmarks (N,) rows; one pass over all observations of the map."""
     wanted = np.full(len(sparse_map.points_world), -1, np.int64)
-    wanted[ids] = np.arange(len(ids))
-    poses, H, squared, count = sparse_map.T_cam_world, np.zeros((len(ids), 3, 3)), np.zeros(len(ids)), np.zeros(len(ids), np.int64)
+    wanted[landmarks] = np.arange(len(landmarks))
+    poses, n = sparse_map.T_cam_world, len(landmarks)
+    H, squared, count = np.zeros((n, 3, 3)), np.zeros(n), np.zeros(n, np.int64)
     R, t = np.ascontiguousarray(poses[:, :3, :3]), np.ascontiguousarray(poses[:, :3, 3])
     _information(
         camera.intrinsics, R, t, np.array(sparse_map.keyframe_starts), sparse_map.obs_landmark, sparse_map.obs_valid,
@@ -173,8 +174,8 @@ def unit_information(sparse_map: SparseMap, ids: Array, camera: Camera) -> UnitI
     return UnitInformation(H, squared, count)
 
 
-def information_by_id(sparse_map: SparseMap, camera: Camera) -> UnitInformation:
-    """That of all landmarks, by id (L,): for a map that changes no more, so that each keyframe need not look for its own."""
+def information_by_row(sparse_map: SparseMap, camera: Camera) -> UnitInformation:
+    """That of all landmarks, by row (L,): for a map that changes no more, so that each keyframe need not look for its own."""
     return unit_information(sparse_map, np.arange(len(sparse_map.points_world)), camera)
 
 
@@ -203,26 +204,28 @@ class Vertices(NamedTuple):
 
 
 def keyframe_vertices(
-    sparse_map: SparseMap, keyframe: int, camera: Camera, config: SnapshotConfig, by_id: UnitInformation | None = None
+    sparse_map: SparseMap, keyframe: int, camera: Camera, config: SnapshotConfig, by_row: UnitInformation | None = None
 ) -> Vertices:
-    """The landmarks observed in a keyframe; `by_id` as for `vertices_of`."""
+    """The landmarks observed in a keyframe; `by_row` as for `vertices_of`."""
     rows = sparse_map.observations_of(keyframe)
-    ids = sparse_map.obs_landmark[rows]
-    return vertices_of(sparse_map, ids[sparse_map.obs_valid[rows] & sparse_map.is_mapped(ids)], keyframe, camera, config, by_id)
+    landmarks = sparse_map.obs_landmark[rows]
+    return vertices_of(
+        sparse_map, landmarks[sparse_map.obs_valid[rows] & sparse_map.is_mapped(landmarks)], keyframe, camera, config, by_row
+    )
 
 
 def vertices_of(
-    sparse_map: SparseMap, ids: Array, keyframe: int, camera: Camera, config: SnapshotConfig, by_id: UnitInformation | None = None
+    sparse_map: SparseMap, landmarks: Array, keyframe: int, camera: Camera, config: SnapshotConfig, by_row: UnitInformation | None = None
 ) -> Vertices:
-    """Of landmarks (N,) ids, those in front of a keyframe's camera whose depth is known well enough.
+    """Of landmarks (N,) rows, those in front of a keyframe's camera whose depth is known well enough.
 
     Args:
-        by_id: `information_by_id` of the map as it is, where there is one.
+        by_row: `information_by_row` of the map as it is, where there is one.
     """
-    ids = ids[sparse_map.num_observations[ids] >= config.min_observations]
-    points, T = sparse_map.points_world[ids], sparse_map.T_cam_world[keyframe]
+    landmarks = landmarks[sparse_map.num_observations[landmarks] >= config.min_observations]
+    points, T = sparse_map.points_world[landmarks], sparse_map.T_cam_world[keyframe]
     in_camera = points @ T[:3, :3].T + T[:3, 3]
-    information, squared, count = unit_information(sparse_map, ids, camera) if by_id is None else by_id.of(ids)
+    information, squared, count = unit_information(sparse_map, landmarks, camera) if by_row is None else by_row.of(landmarks)
     variances, rms = observation_variances(squared, count, config), np.sqrt(squared / np.maximum(count, 1))
     deviations = relative_depth_deviations(information / variances[:, None, None], points, T)
     usable = (in_camera[:, 2] > 0) & (deviations < config.max_relative_deviation) & (rms < config.max_reprojection_rms_px)
@@ -234,15 +237,15 @@ def point_cloud(sparse_map: SparseMap, camera: Camera, config: CloudConfig, nois
     statistics = landmark_statistics(sparse_map, camera)
     good = ~np.isnan(sparse_map.points_world[:, 0]) & (statistics.num_observations >= config.min_observations)
     good &= (statistics.parallax_deg >= config.min_parallax_deg) & (statistics.reprojection_rms_px <= config.max_reprojection_rms_px)
-    ids = np.flatnonzero(good)
-    points = sparse_map.points_world[ids]
-    information = landmark_information(sparse_map, ids, camera, noise)
-    last_seen_from = sparse_map.T_cam_world[sparse_map.keyframe_of(sparse_map.last_observation[ids])]
+    landmarks = np.flatnonzero(good)
+    points = sparse_map.points_world[landmarks]
+    information = landmark_information(sparse_map, landmarks, camera, noise)
+    last_seen_from = sparse_map.T_cam_world[sparse_map.keyframe_of(sparse_map.last_observation[landmarks])]
     return PointCloud(
         points,
-        sparse_map.colors[ids],
-        statistics.num_observations[ids],
-        statistics.parallax_deg[ids].astype(np.float32),
-        statistics.reprojection_rms_px[ids].astype(np.float32),
+        sparse_map.colors[landmarks],
+        statistics.num_observations[landmarks],
+        statistics.parallax_deg[landmarks].astype(np.float32),
+        statistics.reprojection_rms_px[landmarks].astype(np.float32),
         relative_depth_deviations(information, points, last_seen_from).astype(np.float32),
     )

@@ -118,6 +118,7 @@ class Mapper:
     def refine_calibration(self) -> None:
         """The camera's parameters from all of the map (or as they were); the map moves along."""
         with self.times.timed("self_calibration"):
+            self.take_adjustment(wait=True)  # it is of the camera before
             self._use(self.calibration.refine(self.map, self.camera))
             self.adjustment.forget_past()
 
@@ -166,7 +167,9 @@ class Mapper:
 
     def condensed_when_due(self) -> Condensation | None:
         """Once in a while, what is left of the map without what it can do without."""
-        if self.map.num_keyframes == 0 or not is_due(self.map, self.tracker.num_born - self._num_born_before, self.config.memory):
+        new_rows = len(self.map.points_world) - len(self.map.remembered_ids)  # with gaps where other maps took ids
+        new_tracks = max(new_rows, self.tracker.num_born - self._num_born_before)
+        if self.map.num_keyframes == 0 or not is_due(self.map, new_tracks, self.config.memory):
             return None
         with self.times.timed("condense"):
             self.take_adjustment(wait=True)
@@ -187,6 +190,6 @@ class Mapper:
         self.adjustment.forget_past()
         self.map, self._num_born_before = done.map, self.tracker.num_born
 
-    def snapshot(self, keyframe: int, frame: Frame, map_number: int, by_id: UnitInformation | None) -> MapSnapshot:
+    def snapshot(self, keyframe: int, frame: Frame, map_number: int, by_row: UnitInformation | None) -> MapSnapshot:
         """A keyframe with the depths of its landmarks as the map has them now."""
-        return snapshot_of(self.map, keyframe, frame, self.camera, self.config, map_number, by_id)
+        return snapshot_of(self.map, keyframe, frame, self.camera, self.config, map_number, by_row)

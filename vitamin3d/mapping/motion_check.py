@@ -48,9 +48,9 @@ def second_opinion(sparse_map: SparseMap, camera: Camera, config: MotionCheckCon
 def _landmarks_of(sparse_map: SparseMap, keyframe: int) -> tuple[Array, Array]:
     """Ids (N,) and ideal pixels (N, 2) of the landmarks that a keyframe observes."""
     rows = sparse_map.observations_of(keyframe)
-    ids = sparse_map.obs_landmark[rows]
-    good = sparse_map.obs_valid[rows] & sparse_map.is_mapped(ids)
-    return ids[good], sparse_map.obs_pixels[rows][good]
+    landmarks = sparse_map.obs_landmark[rows]
+    good = sparse_map.obs_valid[rows] & sparse_map.is_mapped(landmarks)
+    return landmarks[good], sparse_map.obs_pixels[rows][good]
 
 
 def _opinion(keyframe: int, T_1_0: Array, pixels_0: Array, pixels_1: Array, camera: Camera, config: MotionCheckConfig) -> Opinion | None:

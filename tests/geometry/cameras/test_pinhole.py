@@ -8,6 +8,7 @@ import reference
 from scenes import EUROC, PINHOLE
 
 from vitamin3d.geometry.cameras import PinholeCamera
+from vitamin3d.geometry.se3 import exp_se3, transform_points
 
 
 def grid(camera, step=37):
@@ -125,3 +126,21 @@ def test_the_canvas_is_black_outside_the_picture():
     assert drawn.shape == (canvas.height, canvas.width)
     assert drawn[0, canvas.width // 2] == 0 and drawn[canvas.height // 2, canvas.width // 2] == 200
     assert 0.6 < (drawn == 200).mean() < 0.95
+
+
+def test_what_is_projected_is_seen_along_its_ray(rng):
+    points = rng.uniform([-1, -1, 2], [1, 1, 5], (50, 3))
+    rays = EUROC.unproject(EUROC.project(points))
+    np.testing.assert_allclose(rays, points / points[:, 2:], atol=1e-9)
+    assert np.isnan(EUROC.project(-points)).all()
+
+
+def test_pose_jacobians_are_the_differences(rng):
+    points, step = rng.uniform([-1, -1, 2], [1, 1, 5], (20, 3)), 1e-6
+    for axis in range(6):
+        xi = np.zeros(6)
+        xi[axis] = step
+        ahead, back = (PINHOLE.ideal_from_points(transform_points(exp_se3(x), points)) for x in (xi, -xi))
+        expected = (ahead - back) / (2 * step)
+        for J, column in zip(PINHOLE.pose_jacobians(points), expected.T, strict=True):
+            np.testing.assert_allclose(J[:, axis], column, rtol=1e-5, atol=1e-4)
