@@ -3,7 +3,7 @@
 
 from dataclasses import dataclass
 from functools import cache
-from typing import Any, Protocol
+from typing import Any
 
 import numpy as np
 
@@ -49,7 +49,7 @@ class TsdfVolume:
             raise InputError(f"fusion.backend must be one of {', '.join(BACKENDS)}, not {backend!r}")
         check_backend(backend)
         self.voxel_length = voxel_length
-        self._volume: _Backend = BACKENDS[backend](voxel_length, truncation, limits)
+        self._volume = BACKENDS[backend](voxel_length, truncation, limits)
 
     def integrate(self, view: DepthView, canvas: Camera, max_depth: float) -> None:
         """Averages a view, drawn on `canvas`, into the volume; depths beyond `max_depth` (map units) are left out."""
@@ -73,16 +73,6 @@ class TsdfVolume:
     def extract_surface(self) -> Surface:
         """The zero level (marching cubes), triangles facing the cameras; vertex normals are not filled in yet (zero)."""
         return self._volume.extract_surface()
-
-
-class _Backend(Protocol):
-    def __init__(self, voxel_length: float, truncation: float, limits: Limits) -> None: ...
-
-    def integrate(self, view: DepthView, canvas: Camera, max_depth: float) -> None: ...
-
-    def extract_surface(self) -> Surface: ...
-
-    def size(self) -> dict[str, int] | None: ...
 
 
 class _ScalableVolume:
@@ -136,7 +126,7 @@ class _WeightedBlocks:
         return _surface(*self._volume.extract())
 
 
-BACKENDS: dict[str, type[_Backend]] = {"scalable": _ScalableVolume, "blocks": _WeightedBlocks}
+BACKENDS: dict[str, type[_ScalableVolume] | type[_WeightedBlocks]] = {"scalable": _ScalableVolume, "blocks": _WeightedBlocks}
 
 
 def certain_depth(view: DepthView, max_relative_deviation: float, max_depth: float) -> Array:

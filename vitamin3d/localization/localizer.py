@@ -18,7 +18,7 @@ from vitamin3d.types import Array, Frame, FrontEndFrame, Localization, SlamState
 
 
 class Localizer:
-    """Finds the camera of each frame in one map; `state` says how.
+    """Finds the camera of each frame in one map; `state` says how. What its methods do is said by `CameraLocalizer`.
 
     Args:
         tracker: its tracks that contradict a pose are ended.
@@ -81,7 +81,6 @@ class Localizer:
         return found.T_cam_world
 
     def position_deviation_deg(self, T_cam_world: Array) -> float:
-        """Of the camera's place by the landmarks that vote and agree with it."""
         seen, pixels = self.tracker.seen()
         sparse_map, camera = self.mapper.map, self.mapper.camera
         is_mapped, rows = sparse_map.mapped(seen.ids)
@@ -150,7 +149,6 @@ class Localizer:
         self._turned_frames.clear()
 
     def note_directions(self) -> None:
-        """The tracks seen now are known by their directions, should the camera turn away from all landmarks."""
         seen, pixels = self.tracker.seen()
         self._directions.note(seen.ids, pixels, self.poses.newest(self.mapper.map)[:3, :3], self.mapper.camera)
 
@@ -184,22 +182,18 @@ class Localizer:
         return self.refine(T_cam_world)
 
     def lose(self) -> None:
-        """What was found lately is not believed any more."""
         self.state = SlamState.LOST
 
     # --- keyframes in which the camera may be found again ------------------------------------------------------------
 
     def remember(self, keyframe: int, frame: Frame) -> None:
-        """A new keyframe and its picture."""
         self._remembered.add(keyframe, frame)
 
     def begin(self, keyframes: list[Frame]) -> None:
-        """There is a map now, with these keyframes."""
         self._directions = Directions(self.tracker.first_id)
         for keyframe, frame in enumerate(keyframes):
             self._remembered.add(keyframe, frame)
 
     def forget(self, kept_keyframes: Array, kept_ids: Array) -> None:
-        """The map is smaller now: of its keyframes those with the old numbers (K',) stay, of its tracks those with the ids (I,)."""
         self._remembered.move_to(kept_keyframes)
         self._directions.keep(kept_ids)

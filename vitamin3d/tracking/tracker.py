@@ -26,7 +26,7 @@ class TrackIds:
 
 
 class Tracker:
-    """Follows the extrema of curvature from frame to frame.
+    """Follows the extrema of curvature from frame to frame; what its methods do is said by `LandmarkTracker`.
 
     Args:
         camera: whose ideal pixels `seen` has; `use_camera` changes it.
@@ -53,7 +53,6 @@ class Tracker:
         )
 
     def use_camera(self, camera: Camera) -> None:
-        """Ideal pixels are those of this camera from now on."""
         self.camera = camera
 
     def follow(self, front: FrontEndFrame, measures_motion: bool) -> tuple[int, Array] | None:
@@ -102,11 +101,9 @@ class Tracker:
 
     @property
     def is_refill_due(self) -> bool:
-        """Every few frames."""
         return self.frame_count % self.config.extrema.refill_interval == 0
 
     def refill(self, front: FrontEndFrame) -> None:
-        """Free extrema become tracks."""
         new = select_free_extrema(front.extrema, self.tracks.pixels, front.kappa.shape, self.config.extrema)
         ids, zeros = self._ids.take(len(new)), np.zeros(len(new), np.int32)
         self.num_born += len(new)
@@ -114,36 +111,29 @@ class Tracker:
         self.tracks = Tracks.concatenate(self.tracks, Tracks(ids, refine_extrema(front.kappa, new), kappa, zeros, zeros))
 
     def take_up(self, tracks: Tracks) -> None:
-        """These are the live tracks from now on: some came back, some gave way to them."""
         self.tracks = tracks
 
     def end(self, ids: Array) -> None:
-        """Ends the tracks with these ids (N,)."""
         if len(ids):
             self.tracks = self.tracks.select(~np.isin(self.tracks.ids, ids))
 
     def end_all(self) -> None:
-        """Ends every track."""
         self.tracks = Tracks.empty()
 
     def end_frame(self, frame: Frame) -> None:
-        """The next frame continues this one."""
         self.frame_count += 1
         self.newest_frame = frame.index
 
     def pass_over(self, frame: Frame) -> None:
-        """A picture that repeats the one before: the tracks are where they are."""
         self.newest_frame = frame.index
 
     def continue_from(self, views: Sequence[TrackedView]) -> None:
-        """Goes on with the tracks of the newest of some frames of another tracker."""
         newest = views[-1]
         self.newest_frame, self._last_ns = newest.frame.index, newest.frame.timestamp_ns
         self.first_id = min(int(view.tracks.ids.min(initial=self.first_id)) for view in views)
         self.tracks, self.image_motion = newest.tracks, newest.image_motion
 
     def seen(self) -> tuple[Tracks, Array]:
-        """The tracks that do not coast, and their ideal pixels (N, 2)."""
         at = self.tracks, self.image_motion, self.camera
         if not all(a is b for a, b in zip(at, self._last_seen[0], strict=True)):
             self._last_seen = at, self._compute_seen()
@@ -156,5 +146,4 @@ class Tracker:
         return seen.select(valid), pixels[valid]
 
     def view(self, frame: Frame) -> TrackedView:
-        """The newest frame with the tracks seen in it."""
         return TrackedView(frame, *self.seen(), self.image_motion)

@@ -73,7 +73,7 @@ def _undistort_pixels(pixels, model, steps, tolerance, out):  # type: ignore[no-
 
 @dataclass(frozen=True)
 class PinholeCamera:
-    """A calibrated camera: intrinsics in pixels, distortion, picture size."""
+    """A calibrated camera: intrinsics in pixels, distortion, picture size. What its methods do is said by `Camera`."""
 
     fx: float
     fy: float
@@ -88,17 +88,14 @@ class PinholeCamera:
 
     @property
     def K(self) -> Array:
-        """(3, 3) intrinsic matrix."""
         return np.array([[self.fx, 0.0, self.cx], [0.0, self.fy, self.cy], [0.0, 0.0, 1.0]])
 
     @property
     def intrinsics(self) -> Array:
-        """(4,) fx fy cx cy, for the kernels."""
         return np.array([self.fx, self.fy, self.cx, self.cy])
 
     @property
     def model(self) -> Array:
-        """(8,) fx fy cx cy k1 k2 p1 p2, for the kernels."""
         return np.array([self.fx, self.fy, self.cx, self.cy, *self.distortion])
 
     @property
@@ -108,19 +105,15 @@ class PinholeCamera:
 
     @property
     def half_field(self) -> tuple[float, float]:
-        """Tangents of half the angles of view, right and down."""
         return 0.5 * self.width / self.fx, 0.5 * self.height / self.fy
 
     def radians(self, pixels: float) -> float:
-        """The angle that so many pixels make up in the middle of the picture."""
         return pixels / self.fx
 
     def with_readout(self, readout_s: float) -> "PinholeCamera":
-        """The same camera with another readout time."""
         return replace(self, readout_s=readout_s)
 
     def with_model(self, model: Array) -> "PinholeCamera":
-        """A camera with the same picture and `model` (8,) fx fy cx cy k1 k2 p1 p2."""
         fx, fy, cx, cy, k1, k2, p1, p2 = (float(value) for value in model)
         return replace(self, fx=fx, fy=fy, cx=cx, cy=cy, distortion=(k1, k2, p1, p2))
 
@@ -129,15 +122,12 @@ class PinholeCamera:
         return any(self.distortion)
 
     def project(self, points_cam: Array) -> Array:
-        """Distorted pixels (N, 2) of points (N, 3) in the camera frame; NaN behind the camera."""
         return self.distort(self.ideal_from_points(points_cam))
 
     def unproject(self, pixels: Array) -> Array:
-        """Rays (N, 3) with z = 1 of distorted pixels (N, 2); NaN where the model cannot be inverted."""
         return self.rays_from_ideal(self.undistort(pixels))
 
     def pose_jacobians(self, points_cam: Array) -> tuple[Array, Array]:
-        """(N, 6) each: derivatives of the ideal pixels u and v by the tangent [translation, rotation] of the pose."""
         x, y, depth = points_cam[:, 0] / points_cam[:, 2], points_cam[:, 1] / points_cam[:, 2], points_cam[:, 2]
         zero = np.zeros_like(x)
         J_u = self.fx * np.stack([1.0 / depth, zero, -x / depth, -x * y, 1.0 + x * x, -y], axis=1)
@@ -145,20 +135,16 @@ class PinholeCamera:
         return J_u, J_v
 
     def ideal_from_points(self, points_cam: Array) -> Array:
-        """Ideal pixels (N, 2) of points (N, 3) in the camera frame; NaN behind the camera."""
         z = np.where(points_cam[:, 2] > 0, points_cam[:, 2], np.nan)
         return np.stack([self.fx * points_cam[:, 0] / z + self.cx, self.fy * points_cam[:, 1] / z + self.cy], axis=1)
 
     def rays_from_ideal(self, pixels: Array) -> Array:
-        """Rays (N, 3) with z = 1 of ideal pixels (N, 2)."""
         return np.stack([(pixels[:, 0] - self.cx) / self.fx, (pixels[:, 1] - self.cy) / self.fy, np.ones(len(pixels))], axis=1)
 
     def undistort(self, pixels: Array) -> Array:
-        """Ideal pixels (N, 2) of distorted pixels (N, 2); NaN where the model cannot be inverted."""
         return self._mapped(pixels, inverse=True)
 
     def distort(self, pixels: Array) -> Array:
-        """Distorted pixels (N, 2) of ideal pixels (N, 2)."""
         return self._mapped(pixels, inverse=False)
 
     def _mapped(self, pixels: Array, inverse: bool) -> Array:
@@ -173,7 +159,6 @@ class PinholeCamera:
         return out
 
     def is_inside(self, pixels: Array, margin: float = 0.0) -> Array:
-        """(N,) bool: distorted pixels that lie in the picture, `margin` pixels from its border; False for NaN."""
         u, v = pixels[:, 0], pixels[:, 1]
         return np.asarray((u >= margin) & (v >= margin) & (u <= self.width - 1 - margin) & (v <= self.height - 1 - margin))
 
@@ -198,27 +183,22 @@ class PinholeCamera:
         return PinholeCamera(self.fx, self.fy, float(self.cx - left), float(self.cy - top), int(width), int(height))
 
     def scaled(self, factor: float) -> "PinholeCamera":
-        """The camera of the same picture with `factor` times as many pixels along each side, without distortion."""
         cx, cy = (factor * (center + 0.5) - 0.5 for center in (self.cx, self.cy))
         return PinholeCamera(factor * self.fx, factor * self.fy, cx, cy, round(factor * self.width), round(factor * self.height))
 
     def cropped(self, width: int, height: int) -> "PinholeCamera":
-        """The camera of the picture's part from its top left corner on."""
         return replace(self, width=width, height=height)
 
     def ideal_in(self, other: Camera, pixels: Array) -> Array:
-        """Ideal pixels (N, 2) of this camera where another camera at the same place, turned alike, sees the same rays."""
         there = other.intrinsics
         factors = there[:2] / [self.fx, self.fy]
         return np.asarray(factors * (pixels - [self.cx, self.cy]) + there[2:])
 
     @cached_property
     def whole_canvas(self) -> "PinholeCamera":
-        """`canvas` with its own limit, computed once."""
         return self.canvas()
 
     def canvas_maps(self, canvas: Camera) -> tuple[Array, Array]:
-        """`cv2.remap` maps (H, W) float32 that draw this camera's picture on `canvas`."""
         grid = np.stack(np.meshgrid(np.arange(canvas.width, dtype=float), np.arange(canvas.height, dtype=float)), -1).reshape(-1, 2)
         ideal = canvas.rays_from_ideal(grid)[:, :2] * [self.fx, self.fy] + [self.cx, self.cy]
         source = self.distort(ideal)
@@ -228,5 +208,4 @@ class PinholeCamera:
         return np.ascontiguousarray(source[..., 0]), np.ascontiguousarray(source[..., 1])
 
     def draw_on_canvas(self, image: Array, maps: tuple[Array, Array]) -> Array:
-        """The picture undistorted onto the canvas of `canvas_maps`; black outside."""
         return np.asarray(cv2.remap(image, maps[0], maps[1], cv2.INTER_LINEAR))
