@@ -54,6 +54,15 @@ def demo():
 
 
 @pytest.fixture(scope="session")
+def compiled_kernels():
+    """For tests that give processes of their own so much time: on a fresh checkout compiling takes longer than what they do."""
+    from vitamin3d.config import Config
+    from vitamin3d.warmup import warm_up
+
+    warm_up([Config()])
+
+
+@pytest.fixture(scope="session")
 def finished_benchmark(tmp_path_factory):
     """A benchmark of one short sequence, two trials."""
     from vitamin3d.benchmark.trial import SequenceJob, run_sequence
