@@ -184,3 +184,22 @@ def warped(image, A, b):
 def demo_copy(folder):
     """The demo as a sequence of that name."""
     return Path(shutil.copytree(DEMO, folder, ignore=shutil.ignore_patterns("depth0", "scene.ply")))
+
+
+class Late:
+    """Adjusts at once, and gives the result only where it is waited for."""
+
+    def __init__(self):
+        self.result = None
+
+    @property
+    def is_busy(self):
+        return self.result is not None
+
+    def begin(self, task):
+        self.result = task()
+
+    def take(self, wait=False):
+        result = self.result if wait else None
+        self.result = None if wait else self.result
+        return result

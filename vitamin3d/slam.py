@@ -10,6 +10,7 @@ from vitamin3d.initialization.heritage import Heritage
 from vitamin3d.initialization.initializer import Beginning, Initializer
 from vitamin3d.localization.pose_log import PoseLog
 from vitamin3d.localization.repeated_pictures import RepeatedPictures
+from vitamin3d.mapping.keyframe_handover import snapshot_of
 from vitamin3d.mapping.landmark_statistics import UnitInformation
 from vitamin3d.mapping.map_adjustment import MapAdjustment
 from vitamin3d.mapping.map_condensation import Condensation
@@ -167,7 +168,7 @@ class Slam:
 
         `by_row` is the map's `information_by_row`, for many keyframes of a map that is finished.
         """
-        return self.mapper.snapshot(keyframe, frame, self.number, by_row)
+        return snapshot_of(self.map, keyframe, frame, self.camera, self.config, self.number, by_row)
 
     def trajectory(self) -> Trajectory:
         """Camera-to-world poses of all localised frames."""

@@ -1,13 +1,11 @@
 # SPDX-License-Identifier: Apache-2.0
 """From one map to the next: what the map that follows begins with, and what the one that is left keeps."""
 
-from dataclasses import replace
-
 import numpy as np
 
 from vitamin3d.geometry.cameras import Camera
-from vitamin3d.geometry.rolling_shutter import ideal_pixels
 from vitamin3d.slam import Slam
+from vitamin3d.tracking.tracker import with_ideal_pixels
 from vitamin3d.types import SlamState, TrackedView
 
 
@@ -21,9 +19,7 @@ def succeed(slam: Slam, lost: Slam) -> SlamState:
 
 def _seen_by(camera: Camera, view: TrackedView) -> TrackedView:
     """The view with the ideal pixels of a camera that may be another one than when it was tracked: that was refined since."""
-    pixels = ideal_pixels(view.tracks.pixels, view.image_motion, camera)
-    valid = np.isfinite(pixels[:, 0])
-    return replace(view, tracks=view.tracks.select(valid), ideal_pixels=pixels[valid])
+    return TrackedView(view.frame, *with_ideal_pixels(view.tracks, view.image_motion, camera), view.image_motion)
 
 
 def leave(slam: Slam, successor: Slam) -> bool:

@@ -5,7 +5,7 @@ import dataclasses
 
 import numpy as np
 import pytest
-from scenes import PINHOLE, arc_scene, map_of, perturbed, project, rotation_error_deg, with_noise
+from scenes import PINHOLE, Late, arc_scene, map_of, perturbed, project, rotation_error_deg, with_noise
 
 from vitamin3d.bundle_adjustment.adjust import adjust_bundle
 from vitamin3d.config import BundleAdjustmentConfig, Config, WindowConfig
@@ -18,25 +18,6 @@ from vitamin3d.sparse_map import SparseMap
 from vitamin3d.types import StepTimes
 
 EXACT = dataclasses.replace(Config(), bundle_adjustment=BundleAdjustmentConfig(points_per_keyframe=0, keyframe_iterations=15))
-
-
-class Late:
-    """Adjusts at once, and gives the result only where it is waited for."""
-
-    def __init__(self):
-        self.result = None
-
-    @property
-    def is_busy(self):
-        return self.result is not None
-
-    def begin(self, task):
-        self.result = task()
-
-    def take(self, wait=False):
-        result = self.result if wait else None
-        self.result = None if wait else self.result
-        return result
 
 
 class Solver:

@@ -5,7 +5,7 @@ import dataclasses
 
 import numpy as np
 import pytest
-from scenes import PINHOLE, arc_scene, map_of, orbit, perturbed, project, texture, with_noise
+from scenes import PINHOLE, Late, arc_scene, map_of, orbit, perturbed, project, texture, with_noise
 
 from vitamin3d.bundle_adjustment.adjust import adjust_bundle
 from vitamin3d.config import (
@@ -25,6 +25,7 @@ from vitamin3d.geometry.se3 import exp_se3, inverse
 from vitamin3d.image.curvature import curvature
 from vitamin3d.image.extrema import detect_extrema, refine_extrema
 from vitamin3d.image.patches import cut_patches
+from vitamin3d.mapping.keyframe_handover import snapshot_of
 from vitamin3d.mapping.map_adjustment import MapAdjustment
 from vitamin3d.mapping.mapper import Mapper
 from vitamin3d.mapping.window_adjustment import AdjustAtOnce
@@ -35,25 +36,6 @@ from vitamin3d.types import DominantFlow, Frame, FrontEndFrame, StepTimes, Track
 PICTURE = np.zeros((PINHOLE.height, PINHOLE.width), np.uint8)
 STEP = exp_se3(np.array([-0.36, 0.0, 0.0, 0.0, 0.06, 0.0]))
 """About from one keyframe of the arc to the next."""
-
-
-class Late:
-    """Adjusts at once, and gives the result only where it is waited for."""
-
-    def __init__(self):
-        self.result = None
-
-    @property
-    def is_busy(self):
-        return self.result is not None
-
-    def begin(self, task):
-        self.result = task()
-
-    def take(self, wait=False):
-        result = self.result if wait else None
-        self.result = None if wait else self.result
-        return result
 
 
 def front_of(index, picture=PICTURE, kappa=None):
@@ -226,11 +208,11 @@ def test_the_whole_map_is_adjusted_at_the_end_where_the_settings_allow_it(scene,
 
 def test_a_snapshot_shows_the_map_as_it_is_now(scene):
     mapper, frame = mapper_of(map_of(scene)), front_of(30).frame
-    snapshot = mapper.snapshot(3, frame, 5, None)
+    snapshot = snapshot_of(mapper.map, 3, frame, mapper.camera, mapper.config, 5, None)
     assert snapshot.frame is frame and snapshot.map_number == 5 and len(snapshot.depths) > 100
     mapper.map.points_world[:] *= 2.0
     mapper.map.T_cam_world[:, :3, 3] *= 2.0
-    np.testing.assert_allclose(mapper.snapshot(3, frame, 5, None).depths, 2.0 * snapshot.depths)
+    np.testing.assert_allclose(snapshot_of(mapper.map, 3, frame, mapper.camera, mapper.config, 5, None).depths, 2.0 * snapshot.depths)
 
 
 def test_a_bent_map_says_since_when(rng):

@@ -9,11 +9,10 @@ from vitamin3d.config import Config
 from vitamin3d.geometry.cameras import Camera
 from vitamin3d.geometry.se3 import inverse
 from vitamin3d.mapping.calibration_refinement import CalibrationRefinement
-from vitamin3d.mapping.keyframe_handover import KeyframeHandover, snapshot_of
+from vitamin3d.mapping.keyframe_handover import KeyframeHandover
 from vitamin3d.mapping.keyframe_selection import is_keyframe
 from vitamin3d.mapping.keyframe_views import add_view
 from vitamin3d.mapping.landmark_recovery import recover_landmarks, same_landmarks
-from vitamin3d.mapping.landmark_statistics import UnitInformation
 from vitamin3d.mapping.landmark_triangulation import Rigidity, triangulate_landmarks
 from vitamin3d.mapping.map_adjustment import MapAdjustment
 from vitamin3d.mapping.map_condensation import Condensation, condense, condensed, is_due
@@ -21,7 +20,7 @@ from vitamin3d.mapping.motion_check import MotionCheck
 from vitamin3d.mapping.readout_estimation import set_image_motion
 from vitamin3d.sparse_map import SparseMap
 from vitamin3d.steps import LandmarkTracker
-from vitamin3d.types import Array, Frame, FrontEndFrame, MapSnapshot
+from vitamin3d.types import Array, Frame, FrontEndFrame
 
 
 class Mapper:
@@ -189,7 +188,3 @@ class Mapper:
         self._motion_check.move_to(done.kept_keyframes)
         self.adjustment.forget_past()
         self.map, self._num_born_before = done.map, self.tracker.num_born
-
-    def snapshot(self, keyframe: int, frame: Frame, map_number: int, by_row: UnitInformation | None) -> MapSnapshot:
-        """A keyframe with the depths of its landmarks as the map has them now."""
-        return snapshot_of(self.map, keyframe, frame, self.camera, self.config, map_number, by_row)

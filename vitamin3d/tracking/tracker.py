@@ -25,6 +25,13 @@ class TrackIds:
         return np.arange(self.next - count, self.next)
 
 
+def with_ideal_pixels(tracks: Tracks, image_motion: Array, camera: Camera) -> tuple[Tracks, Array]:
+    """The tracks that a camera's model can undistort, and their ideal pixels (N, 2)."""
+    pixels = ideal_pixels(tracks.pixels, image_motion, camera)
+    valid = np.isfinite(pixels[:, 0])
+    return tracks.select(valid), pixels[valid]
+
+
 class Tracker:
     """Follows the extrema of curvature from frame to frame; what its methods do is said by `LandmarkTracker`.
 
@@ -140,10 +147,7 @@ class Tracker:
         return self._last_seen[1]
 
     def _compute_seen(self) -> tuple[Tracks, Array]:
-        seen = self.tracks.select(self.tracks.missed == 0)
-        pixels = ideal_pixels(seen.pixels, self.image_motion, self.camera)
-        valid = np.isfinite(pixels[:, 0])
-        return seen.select(valid), pixels[valid]
+        return with_ideal_pixels(self.tracks.select(self.tracks.missed == 0), self.image_motion, self.camera)
 
     def view(self, frame: Frame) -> TrackedView:
         return TrackedView(frame, *self.seen(), self.image_motion)
